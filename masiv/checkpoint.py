@@ -1,0 +1,52 @@
+"""Resumable stages: a state that is written now and then, atomically, and read back after a kill."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+class Checkpoint:
+    """The state of one stage on disk. ``Checkpoint(None)`` keeps nothing.
+
+    A stage must draw its random numbers from (seed, iteration) alone, so that a state is only
+    tensors, optimiser state and an iteration count, and a resumed stage ends with the same numbers.
+    """
+
+    def __init__(self, path: Path | None, every_s: float = 20.0) -> None:
+        self.path = path
+        self.every_s = every_s
+        self._last = time.monotonic()
+
+    def load(self) -> dict[str, Any] | None:
+        """The last state saved, or None where there is none."""
+        if self.path is None or not self.path.exists():
+            return None
+        import torch
+
+        return torch.load(self.path, weights_only=True)
+
+    def maybe_save(self, make_state: Callable[[], dict[str, Any]]) -> None:
+        """Save ``make_state()`` if the last save is more than ``every_s`` seconds ago."""
+        if self.path is not None and time.monotonic() - self._last >= self.every_s:
+            self.save(make_state())
+
+    def save(self, state: dict[str, Any]) -> None:
+        """Save now, to a temporary name that is then renamed."""
+        if self.path is None:
+            return
+        import torch
+
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self.path.with_suffix(".tmp")
+        torch.save(state, temporary)
+        os.replace(temporary, self.path)
+        self._last = time.monotonic()
+
+    def clear(self) -> None:
+        """Forget the state: the stage is done."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)

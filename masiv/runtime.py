@@ -1,0 +1,36 @@
+"""The one place where Taichi and torch are started."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from masiv.errors import InputError
+
+_started: str | None = None
+
+
+def start(arch: str = "cpu") -> Any:
+    """Start Taichi on ``arch`` (cpu, cuda or vulkan), once a process, and return the ``taichi`` module.
+
+    A second call with the same arch does nothing, since ``ti.init`` would destroy every field.
+    Raises InputError for an unknown arch, for one that this machine lacks, and for a change of arch.
+    """
+    global _started
+    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
+    import taichi as ti
+
+    if _started == arch:
+        return ti
+    if _started is not None:
+        raise InputError(f"taichi already runs on {_started}; start a new process for --arch {arch}")
+    known = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
+    if arch not in known:
+        raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
+    ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0)
+    running = ti.lang.impl.current_cfg().arch
+    if arch != "cpu" and running != known[arch]:
+        ti.reset()
+        raise InputError(f"--arch {arch} is not available on this machine: use --arch cpu")
+    _started = arch
+    return ti
