@@ -35,7 +35,8 @@ class Scene:
     """Multi-view video of one object. World axes, metres, seconds.
 
     ``load(view, frame)`` reads a picture; use ``frame(view, frame)``, which caches and checks the bounds.
-    Frames are integers 0…frame_count-1; times follow as frame / fps.
+    Frames are integers 0…frame_count-1; times follow as frame / fps. ``fit_frames`` is what scene.yaml asks for, if anything.
+    A picture that is missing has ``valid`` False everywhere.
     """
 
     path: Path
@@ -51,6 +52,7 @@ class Scene:
     mask_source: str
     problems: tuple[str, ...] = ()
     hidden_views: tuple[int, ...] = ()
+    fit_frames: int | None = None
     _cache: dict = field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -76,7 +78,9 @@ class Scene:
         """The part of the scene that a fit may see: the first ``fit_frames`` frames, without the held-out cameras."""
         count = self.frame_count if fit_frames is None else fit_frames
         if not 2 <= count <= self.frame_count:
-            raise InputError(f"--fit-frames {count}: the scene has {self.frame_count} frames, give 2 to {self.frame_count}")
+            raise InputError(
+                f"--fit-frames {count}: the scene has {self.frame_count} frames, give 2 to {self.frame_count}"
+            )
         for view in holdout_cameras:
             if not 0 <= view < len(self.cameras):
                 raise InputError(f"--holdout-camera {view}: the scene has cameras 0 to {len(self.cameras) - 1}")

@@ -1,0 +1,96 @@
+"""What a user may say about a scene in a ``scene.yaml`` beside the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+
+from masiv.errors import InputError
+from masiv.scene.scene import Ground
+from masiv.strict import read_yaml, validated
+
+Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+class GroundDeclaration(BaseModel):
+    """A plane {x : normal·x = height}; ``height`` [m] is along the normalised ``normal``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    normal: Vector
+    height: FiniteFloat = 0.0
+
+
+class SceneDeclaration(BaseModel):
+    """Keys of ``scene.yaml``. What is absent follows the layout's own convention.
+
+    fps: frames per second. up_axis: x, y, z, with a minus sign, or three numbers. gravity: three numbers [m/s²], or one
+    magnitude along −up. ground: `none` or {normal, height}. density [kg/m³]. crop_box: two opposite corners [m, world];
+    nothing outside of it is the object. fit_frames: fit on the first N frames unless --fit-frames says otherwise.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    fps: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | Vector | None = None
+    gravity: FiniteFloat | Vector | None = None
+    ground: Literal["none"] | GroundDeclaration | None = None
+    density: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    crop_box: tuple[Vector, Vector] | None = None
+    fit_frames: Annotated[int, Field(ge=2)] | None = None
+
+    @field_validator("up_axis", mode="before")
+    @classmethod
+    def _plus_sign(cls, value: object) -> object:
+        return value.strip().lstrip("+") if isinstance(value, str) else value
+
+    def up(self, default: str) -> np.ndarray:
+        """Unit vector, shape (3,)."""
+        value = default if self.up_axis is None else self.up_axis
+        if isinstance(value, str):
+            sign = -1.0 if value.startswith("-") else 1.0
+            return sign * np.array(AXES[value.lstrip("-")])
+        return _unit(value, "up_axis")
+
+    def gravity_vector(self, up: np.ndarray, default: float) -> np.ndarray:
+        """Shape (3,) [m/s²]. ``default`` is the magnitude along −up."""
+        value = default if self.gravity is None else self.gravity
+        if isinstance(value, tuple):
+            return np.array(value)
+        return -abs(value) * up + 0.0  # + 0.0 turns −0 into 0
+
+    def ground_plane(self, up: np.ndarray, default_height: float | None) -> Ground | None:
+        """The declared ground, or the plane across ``up`` at ``default_height`` [m]. InputError if it faces down."""
+        if self.ground == "none":
+            return None
+        if isinstance(self.ground, GroundDeclaration):
+            ground = Ground(_unit(self.ground.normal, "ground.normal"), self.ground.height)
+            if ground.normal @ up <= 0:
+                raise InputError("scene.yaml: ground.normal points away from up_axis: turn one of them round")
+            return ground
+        return None if default_height is None else Ground(up, default_height)
+
+    def crop_corners(self) -> np.ndarray | None:
+        """The eight corners of the crop box, shape (8, 3) [m], or None."""
+        if self.crop_box is None:
+            return None
+        low, high = np.minimum(*self.crop_box), np.maximum(*self.crop_box)
+        if (high - low).min() <= 0:
+            raise InputError("scene.yaml: crop_box is flat: give two opposite corners")
+        choice = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=bool)
+        return np.where(choice, high, low)
+
+
+def read_declaration(folder: Path) -> SceneDeclaration:
+    """The scene.yaml in ``folder``, or an empty declaration. Raises InputError for an unknown key or a bad value."""
+    path = folder / "scene.yaml"
+    return validated(SceneDeclaration, read_yaml(path), str(path)) if path.exists() else SceneDeclaration()
+
+
+def _unit(vector: tuple[float, float, float], name: str) -> np.ndarray:
+    length = float(np.linalg.norm(vector))
+    if length < 1e-9:
+        raise InputError(f"scene.yaml: {name} is zero, it must be a direction")
+    return np.array(vector) / length

@@ -1,0 +1,102 @@
+"""Every change of axes and of time. Conventions: docs/conventions.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from masiv.errors import InputError
+from masiv.scene.scene import Ground
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def opengl_c2w_to_world_to_camera(camera_to_world: np.ndarray) -> np.ndarray:
+    """OpenGL pose (x right, y up, looking along −z), (3, 4) or (4, 4) [m] -> OpenCV world_to_camera (4, 4) [m].
+
+    The flip acts on the camera's side of the inverse, so t_x keeps its sign while t_y and t_z change theirs.
+    Raises InputError for a pose that is not finite or whose rotation is not one.
+    """
+    pose = np.eye(4)
+    given = np.asarray(camera_to_world, dtype=np.float64)
+    if given.shape not in ((3, 4), (4, 4)):
+        raise InputError(f"a camera pose has shape {given.shape}, it must be 3×4 or 4×4")
+    pose[: given.shape[0]] = given
+    if not np.isfinite(pose).all():
+        raise InputError("a camera pose has a value that is not finite")
+    rotation = pose[:3, :3]
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        raise InputError("a camera pose's 3×3 part is not a rotation (scaled, sheared or mirrored axes)")
+    inverse = np.eye(4)
+    inverse[:3, :3] = rotation.T
+    inverse[:3, 3] = -rotation.T @ pose[:3, 3]
+    return OPENGL_TO_OPENCV @ inverse
+
+
+def frame_of_time(time: float, fps: float) -> int:
+    """The frame at ``time`` [s]. Rounds: truncation is one frame early at k = 5, 7, 10… for 24 fps in float32."""
+    return round(float(time) * fps)
+
+
+def time_of_frame(frame: int, fps: float) -> float:
+    """The time [s] of ``frame``."""
+    return frame / fps
+
+
+@dataclass(frozen=True)
+class SimulationFrame:
+    """The simulator's axes: +y up, ground plane at y = 0. x_simulation = rotation x_world + translation.
+
+    rotation: (3, 3) float64, translation: (3,) float64 [m]. Methods take (..., 3) arrays and keep their shape and
+    float type.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    @classmethod
+    def from_scene(cls, up: np.ndarray, ground: Ground | None) -> SimulationFrame:
+        """The smallest rotation that takes the ground's normal (``up`` where there is no ground) to +y."""
+        axis = np.asarray(up if ground is None else ground.normal, dtype=np.float64)
+        length = np.linalg.norm(axis)
+        if not np.isfinite(length) or length < 1e-12:
+            raise InputError(
+                "the up axis or the ground's normal has no direction: give a finite vector that is not zero"
+            )
+        height = 0.0 if ground is None else ground.height
+        return cls(_rotation_to_y(axis / length), np.array([0.0, -height, 0.0]))
+
+    def points_to_simulation(self, points: np.ndarray) -> np.ndarray:
+        """World points (..., 3) [m] -> simulation points."""
+        points = np.asarray(points)
+        return _as_float(points @ self.rotation.T + self.translation, points)
+
+    def points_to_world(self, points: np.ndarray) -> np.ndarray:
+        """Simulation points (..., 3) [m] -> world points."""
+        points = np.asarray(points)
+        return _as_float((points - self.translation) @ self.rotation, points)
+
+    def vectors_to_simulation(self, vectors: np.ndarray) -> np.ndarray:
+        """World vectors (..., 3), such as velocities, spins and gravity -> simulation vectors."""
+        vectors = np.asarray(vectors)
+        return _as_float(vectors @ self.rotation.T, vectors)
+
+    def vectors_to_world(self, vectors: np.ndarray) -> np.ndarray:
+        """Simulation vectors (..., 3) -> world vectors."""
+        vectors = np.asarray(vectors)
+        return _as_float(vectors @ self.rotation, vectors)
+
+
+def _rotation_to_y(unit: np.ndarray) -> np.ndarray:
+    target = np.array([0.0, 1.0, 0.0])
+    cosine = float(unit @ target)
+    if cosine < -1.0 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])  # half a turn about x: the smallest rotation is not unique there
+    cross = np.cross(unit, target)
+    skew = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1.0 + cosine)
+
+
+def _as_float(result: np.ndarray, like: np.ndarray) -> np.ndarray:
+    return result.astype(like.dtype, copy=False) if np.issubdtype(like.dtype, np.floating) else result
