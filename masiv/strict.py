@@ -15,7 +15,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file; {} for an empty file. Raises InputError where there is none or it is not a mapping."""
+    """The mapping in a YAML file; {} for an empty file. Raises InputError where it cannot be one."""
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:

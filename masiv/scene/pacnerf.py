@@ -1,7 +1,7 @@
 """The PAC-NeRF layout (Li et al., ICLR 2023), also that of MASIV's multi-sequence scenes.
 
-``all_data.json`` lists {file_path, c2w, intrinsic, time}; pictures are ``data/r_V_F.png`` for view V and frame F, frame −1
-the empty background, frame −2 an occluder. World: metres, y up, gravity 9.8 m/s² down, sticky ground at y = 0.
+``all_data.json`` lists {file_path, c2w, intrinsic, time}; pictures are ``data/r_V_F.png`` for view V and frame F,
+frame −1 the empty background, frame −2 an occluder. World: metres, y up, gravity 9.8 m/s² down, sticky ground at y = 0.
 """
 
 from __future__ import annotations
@@ -145,8 +145,8 @@ def _fps(observed: list[_Entry], listing: Path) -> float:
         steps = (entry.time - first.time) * fps
         if frame_of_time(entry.time - first.time, fps) != entry.frame - first.frame or abs(steps - round(steps)) > 0.25:
             raise InputError(
-                f"{listing}: {entry.path.name} has time {entry.time:g} s, which is not frame {entry.frame} at {fps:g} fps; "
-                "fix the times or give fps in scene.yaml"
+                f"{listing}: {entry.path.name} has time {entry.time:g} s, which is not frame {entry.frame} "
+                f"at {fps:g} fps; fix the times or give fps in scene.yaml"
             )
     return fps
 
@@ -203,7 +203,7 @@ def _special(entries: list[_Entry], folder: Path, view_ids: list[int], frame: in
 
 
 def _crop(camera: Camera, corners: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool that the crop box's silhouette covers; all of them for a box that reaches behind the camera."""
+    """Pixels (H, W) bool that the crop box covers; all of them for a box that reaches behind the camera."""
     pixels, depth = camera.project(corners)
     if depth.min() <= 1e-6:
         return np.ones((camera.height, camera.width), bool)

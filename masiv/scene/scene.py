@@ -35,8 +35,8 @@ class Scene:
     """Multi-view video of one object. World axes, metres, seconds.
 
     ``load(view, frame)`` reads a picture; use ``frame(view, frame)``, which caches and checks the bounds.
-    Frames are integers 0…frame_count-1; times follow as frame / fps. ``fit_frames`` is what scene.yaml asks for, if anything.
-    A picture that is missing has ``valid`` False everywhere.
+    Frames are integers 0…frame_count-1; times follow as frame / fps. ``fit_frames`` is what scene.yaml
+    asks for, if anything. A missing picture has ``valid`` False everywhere.
     """
 
     path: Path
