@@ -1,9 +1,9 @@
-"""Shared set-up: two torch threads at most, and Taichi started once, on the CPU."""
+"""Shared set-up: one torch thread (two that wait for each other are 50 times slower on a busy machine), Taichi on the CPU."""
 
 import pytest
 import torch
 
-torch.set_num_threads(2)
+torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

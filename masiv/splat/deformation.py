@@ -19,8 +19,8 @@ class DeformationNetwork(torch.nn.Module):
 
     s is a cubic spline through ``base_motion``, the object's translation at each frame; the bases B carry what is left.
     differs from MASIV: d(x, 0) = 0 by construction, so the canonical shape *is* frame 0 and a trajectory starts where
-    its point is; activations are smooth and the highest time frequency is half of what the frames can carry, so that the
-    network can be asked between frames.
+    its point is; activations are smooth and the highest time frequency is half of what the frames can carry, so that
+    the network can be asked between frames.
 
     The base motion is learnable: a frame's translation is its best observed parameter, and a network that had to
     correct the error of a rough first guess would have to wiggle from frame to frame to do it.
