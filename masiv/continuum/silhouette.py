@@ -1,0 +1,76 @@
+"""Masks as signed distance fields: how far a world point is outside of the silhouettes of one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from masiv.scene.camera import Camera
+from masiv.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """One view of one frame: distance (H, W) float32 [pixels] to the mask's edge, negative on it; valid (H, W) bool."""
+
+    view: int
+    camera: Camera
+    distance: np.ndarray
+    valid: np.ndarray
+
+    def outside(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Judge world points (N, 3) [m] by this view.
+
+        Returns the signed distance to the silhouette (N,) [m at the point's depth, negative on the object, 0 where the
+        view cannot tell], ``inside_image`` (N,) bool, and ``judged`` (N,) bool: in the image, not behind an occluder.
+        """
+        pixels, depth = self.camera.project(points)
+        height, width = self.distance.shape
+        in_front = depth > 1e-6
+        pixels = np.where(in_front[:, None], pixels, -1.0)
+        inside_image = in_front & (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+        column = np.clip(pixels[:, 0], 0, width - 1).astype(np.int32)
+        row = np.clip(pixels[:, 1], 0, height - 1).astype(np.int32)
+        judged = inside_image & self.valid[row, column]
+        pixel_distance = sample_bilinear(self.distance, pixels)
+        metres_per_pixel = np.where(in_front, depth, 0.0) / self.camera.intrinsics[0, 0]
+        return np.where(judged, pixel_distance * metres_per_pixel, 0.0), inside_image, judged
+
+
+def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
+    """The silhouettes of ``frame`` in every view that the scene may look at."""
+    found = []
+    for view in scene.views:
+        picture = scene.frame(view, frame)
+        found.append(Silhouette(view, scene.cameras[view], signed_distance(picture.mask), picture.valid))
+    return tuple(found)
+
+
+def signed_distance(mask: np.ndarray) -> np.ndarray:
+    """mask (H, W) -> (H, W) float32 [pixels]: from pixel centres to the edge of {mask > 0.5}, negative on it.
+
+    An empty mask is infinitely far away: the image's diagonal everywhere.
+    """
+    on = (mask > 0.5).astype(np.uint8)
+    diagonal = float(np.hypot(*mask.shape))
+    if not on.any():
+        return np.full(mask.shape, diagonal, np.float32)
+    outwards = cv2.distanceTransform(1 - on, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # Beyond the border the object may go on, so the border is no edge.
+    padded = cv2.copyMakeBorder(on, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    inwards = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    return np.where(on > 0, 0.5 - np.minimum(inwards, diagonal), outwards - 0.5).astype(np.float32)
+
+
+def sample_bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """image (H, W), pixels (N, 2) as (x, y) with centres at +0.5 -> (N,) float64, clamped at the border."""
+    height, width = image.shape
+    x = np.clip(pixels[:, 0] - 0.5, 0, width - 1)
+    y = np.clip(pixels[:, 1] - 0.5, 0, height - 1)
+    column, row = np.minimum(x.astype(np.int32), width - 2), np.minimum(y.astype(np.int32), height - 2)
+    u, v = x - column, y - row
+    top = image[row, column] * (1 - u) + image[row, column + 1] * u
+    bottom = image[row + 1, column] * (1 - u) + image[row + 1, column + 1] * u
+    return top * (1 - v) + bottom * v
