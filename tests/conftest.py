@@ -1,4 +1,4 @@
-"""Shared set-up: one torch thread (two that wait for each other are 50 times slower on a busy machine), Taichi on the CPU."""
+"""Shared set-up: Taichi on the CPU, torch on one thread (two spin against each other on a busy machine)."""
 
 import pytest
 import torch
