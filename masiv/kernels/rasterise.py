@@ -1,0 +1,159 @@
+"""Front-to-back alpha blending of projected Gaussians, and its adjoint (Kerbl et al. 2023, "3D Gaussian splatting").
+
+    power = -(A dx^2 + C dy^2) / 2 - B dx dy,  alpha = min(0.99, opacity exp(power)),  w = T alpha,  T <- T (1 - alpha)
+
+A Gaussian is skipped at a pixel where alpha < 1/255, and a pixel is finished once T (1 - alpha) would fall below 1e-4.
+
+One thread owns one tile, so a picture needs no atomics; each (Gaussian, tile) pair, called a slot, has a gradient of
+its own, and the slots of a Gaussian are summed in a fixed order. So both directions are reproducible to the bit. Inside
+a tile the loop over Gaussians is the outer one: it visits only the pixels of the Gaussian's own box, and gradients stay
+in registers.
+"""
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import taichi as ti
+
+TILE = 8
+"""Side of a tile [pixels]."""
+CHANNELS = 5
+"""Blended channels: red, green, blue, one (alpha), depth."""
+SPLAT_SIZE = 10
+"""Entries of a projected Gaussian: u, v, conic A, B, C, opacity, red, green, blue, depth."""
+
+ALPHA_SKIP = 1.0 / 255.0
+ALPHA_LIMIT = 0.99
+STOP = 1e-4
+
+
+@lru_cache
+def kernels(real):
+    """The kernels for the Taichi type ``real`` (ti.f32 or ti.f64).
+
+    splats (N, 10), boxes (N, 4) int32: pixels x0, y0, x1, y1 (half-open) that a Gaussian can reach; tile_start
+    (tiles + 1,) int32 into ``members`` (Gaussian, front to back within a tile) and ``slots``; image (H, W, 5);
+    transmittance (H, W), ones at first.
+    """
+    Array1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
+    Boxes = ti.types.ndarray(dtype=ti.i32, ndim=2)
+    Rows = ti.types.ndarray(dtype=real, ndim=2)
+    Picture = ti.types.ndarray(dtype=real, ndim=3)
+    Vec5 = ti.types.vector(CHANNELS, real)
+    Vec10 = ti.types.vector(SPLAT_SIZE, real)
+
+    @ti.func
+    def features(splats: ti.template(), g):
+        return Vec5(splats[g, 6], splats[g, 7], splats[g, 8], real(1.0), splats[g, 9])
+
+    @ti.kernel
+    def blend(
+        splats: Rows,
+        boxes: Boxes,
+        tile_start: Array1,
+        members: Array1,
+        image: Picture,
+        transmittance: Rows,
+        columns: ti.i32,
+    ):
+        for tile in range(tile_start.shape[0] - 1):
+            left = tile % columns * TILE
+            top = tile // columns * TILE
+            for k in range(tile_start[tile], tile_start[tile + 1]):
+                g = members[k]
+                u, v, a, b, c, o = splats[g, 0], splats[g, 1], splats[g, 2], splats[g, 3], splats[g, 4], splats[g, 5]
+                f = features(splats, g)
+                for y in range(ti.max(top, boxes[g, 1]), ti.min(top + TILE, boxes[g, 3])):
+                    for x in range(ti.max(left, boxes[g, 0]), ti.min(left + TILE, boxes[g, 2])):
+                        t = transmittance[y, x]
+                        if t < 0.0:  # finished
+                            continue
+                        dx = real(x + 0.5) - u
+                        dy = real(y + 0.5) - v
+                        power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+                        alpha = ti.min(real(ALPHA_LIMIT), o * ti.exp(power))
+                        if power > 0.0 or alpha < ALPHA_SKIP:
+                            continue
+                        after = t * (1.0 - alpha)
+                        if after < STOP:
+                            transmittance[y, x] = -t
+                            continue
+                        transmittance[y, x] = after
+                        w = t * alpha
+                        for i in ti.static(range(CHANNELS)):
+                            image[y, x, i] = image[y, x, i] + w * f[i]
+
+    @ti.kernel
+    def blend_adjoint(
+        splats: Rows,
+        boxes: Boxes,
+        tile_start: Array1,
+        members: Array1,
+        slots: Array1,
+        image_bar: Picture,
+        transmittance: Rows,
+        behind: Rows,
+        slot_bar: Rows,
+        columns: ti.i32,
+    ):
+        """Walks front to back again. ``behind`` (H, W) starts as <image_bar, image> and loses w <image_bar, f> for
+        each Gaussian, so that d alpha = T <image_bar, f> - behind / (1 - alpha)."""
+        for tile in range(tile_start.shape[0] - 1):
+            left = tile % columns * TILE
+            top = tile // columns * TILE
+            for k in range(tile_start[tile], tile_start[tile + 1]):
+                g = members[k]
+                u, v, a, b, c, o = splats[g, 0], splats[g, 1], splats[g, 2], splats[g, 3], splats[g, 4], splats[g, 5]
+                f = features(splats, g)
+                bar = Vec10(0.0)
+                for y in range(ti.max(top, boxes[g, 1]), ti.min(top + TILE, boxes[g, 3])):
+                    for x in range(ti.max(left, boxes[g, 0]), ti.min(left + TILE, boxes[g, 2])):
+                        t = transmittance[y, x]
+                        if t < 0.0:
+                            continue
+                        dx = real(x + 0.5) - u
+                        dy = real(y + 0.5) - v
+                        power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+                        gauss = ti.exp(power)
+                        alpha = ti.min(real(ALPHA_LIMIT), o * gauss)
+                        if power > 0.0 or alpha < ALPHA_SKIP:
+                            continue
+                        after = t * (1.0 - alpha)
+                        if after < STOP:
+                            transmittance[y, x] = -t
+                            continue
+                        transmittance[y, x] = after
+                        w = t * alpha
+                        q = real(0.0)
+                        for i in ti.static(range(CHANNELS)):
+                            q += image_bar[y, x, i] * f[i]
+                        rest = behind[y, x] - w * q
+                        behind[y, x] = rest
+                        for i in ti.static(range(3)):
+                            bar[6 + i] += w * image_bar[y, x, i]
+                        bar[9] += w * image_bar[y, x, 4]
+                        if o * gauss < ALPHA_LIMIT:
+                            alpha_bar = t * q - rest / (1.0 - alpha)
+                            power_bar = alpha_bar * alpha
+                            bar[0] += power_bar * (a * dx + b * dy)
+                            bar[1] += power_bar * (c * dy + b * dx)
+                            bar[2] -= power_bar * 0.5 * dx * dx
+                            bar[3] -= power_bar * dx * dy
+                            bar[4] -= power_bar * 0.5 * dy * dy
+                            bar[5] += alpha_bar * gauss
+                s = slots[k]
+                for i in ti.static(range(SPLAT_SIZE)):
+                    slot_bar[s, i] = bar[i]
+
+    @ti.kernel
+    def sum_slots(slot_bar: Rows, first_slot: Array1, splat_bar: Rows):
+        """splat_bar (N, 10): the sum of each Gaussian's slots first_slot[g] ... first_slot[g + 1] - 1, in order."""
+        for g in range(splat_bar.shape[0]):
+            total = Vec10(0.0)
+            for s in range(first_slot[g], first_slot[g + 1]):
+                for i in ti.static(range(SPLAT_SIZE)):
+                    total[i] += slot_bar[s, i]
+            for i in ti.static(range(SPLAT_SIZE)):
+                splat_bar[g, i] = total[i]
+
+    return SimpleNamespace(blend=blend, blend_adjoint=blend_adjoint, sum_slots=sum_slots)

@@ -1,0 +1,178 @@
+"""The rasteriser against its plain-torch twin, finite differences and pictures whose answer is known."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from masiv.errors import MasivError
+from masiv.scene.camera import Camera
+from masiv.splat._reference import _render
+from masiv.splat.rasteriser import render
+
+pytestmark = pytest.mark.usefixtures("taichi")
+
+
+def make_camera(width=37, height=29, skew=0.0):
+    """Off-centre principal point, unequal focal lengths, a general pose 2 m away from the origin."""
+    angle = 0.4
+    rotation = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    tilt = np.array([[1, 0, 0], [0, math.cos(0.3), -math.sin(0.3)], [0, math.sin(0.3), math.cos(0.3)]])
+    pose = np.eye(4)
+    pose[:3, :3] = tilt @ rotation
+    pose[:3, 3] = [0.05, -0.1, 2.0]
+    intrinsics = np.array([[60.0, skew, 0.45 * width], [0, 55.0, 0.55 * height], [0, 0, 1]])
+    return Camera("test", width, height, intrinsics, pose)
+
+
+def make_gaussians(count=60, seed=0, dtype=torch.float64):
+    rng = np.random.default_rng(seed)
+    means = rng.uniform(-0.4, 0.4, (count, 3))
+    scales = rng.uniform(0.005, 0.12, count)
+    opacities = rng.uniform(0.002, 1.0, count)
+    colours = rng.uniform(0, 1, (count, 3))
+    return [torch.tensor(a, dtype=dtype, requires_grad=True) for a in (means, scales, opacities, colours)]
+
+
+BACKGROUND = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+
+
+def weighted(picture, seed=3):
+    """A scalar that depends on every pixel of rgb, alpha and depth, with weights of both signs."""
+    generator = torch.Generator().manual_seed(seed)
+    return sum(
+        (p.double() * torch.randn(p.shape, generator=generator, dtype=torch.float64)).sum()
+        for p in (picture.rgb, picture.alpha, picture.depth)
+    )
+
+
+@dataclasses.dataclass
+class Twin:
+    rgb: torch.Tensor
+    alpha: torch.Tensor
+    depth: torch.Tensor
+
+
+@pytest.mark.parametrize(("seed", "skew"), [(0, 0.0), (1, 4.0)])
+def test_same_picture_and_gradients_as_the_twin(seed, skew):
+    camera = make_camera(skew=skew)
+    gaussians = make_gaussians(seed=seed)
+    ours = render(camera, *gaussians, BACKGROUND)
+    twin = Twin(*_render(camera, *gaussians, BACKGROUND))
+    for name in ("rgb", "alpha", "depth"):
+        torch.testing.assert_close(getattr(ours, name), getattr(twin, name), atol=1e-12, rtol=1e-10)
+    gradients = torch.autograd.grad(weighted(ours), gaussians)
+    expected = torch.autograd.grad(weighted(twin), gaussians)
+    for one, other in zip(gradients, expected, strict=True):
+        assert other.abs().max() > 1e-3
+        torch.testing.assert_close(one, other, atol=1e-9 * float(other.abs().max()), rtol=1e-9)
+
+
+def test_opaque_pixels_stop_early_as_the_twin_does():
+    """Many opaque layers: the clip at 0.99 and the stop at T < 1e-4 both act."""
+    camera = make_camera(16, 16)
+    means, _, _, colours = make_gaussians(80)
+    scales = torch.full((80,), 0.3, dtype=torch.float64, requires_grad=True)
+    opacities = torch.linspace(0.6, 1.0, 80, dtype=torch.float64).requires_grad_()
+    gaussians = [means, scales, opacities, colours]
+    ours, twin = render(camera, *gaussians, BACKGROUND), Twin(*_render(camera, *gaussians, BACKGROUND))
+    assert twin.alpha.min() > 0.998
+    torch.testing.assert_close(ours.rgb, twin.rgb, atol=1e-12, rtol=1e-10)
+    pairs = zip(
+        torch.autograd.grad(weighted(ours), gaussians), torch.autograd.grad(weighted(twin), gaussians), strict=True
+    )
+    for one, other in pairs:
+        torch.testing.assert_close(one, other, atol=1e-8 * float(other.abs().max()), rtol=1e-7)
+
+
+def test_finite_differences():
+    """Opacities well above the skip level and moderate cover, so that no threshold lies within the step."""
+    camera = make_camera(20, 18)
+    gaussians = [g.detach() for g in make_gaussians(6, seed=5)]
+    gaussians[2] = gaussians[2] * 0.4 + 0.2
+    for g in gaussians:
+        g.requires_grad_()
+    gradients = torch.autograd.grad(weighted(render(camera, *gaussians, BACKGROUND)), gaussians)
+    rng = np.random.default_rng(0)
+    # The skip at 1/255 makes the picture jump by up to 0.004 at isolated points: the median over directions is immune.
+    for which, step in enumerate((1e-7, 1e-7, 1e-7, 1e-6)):
+        errors = []
+        for _ in range(5):
+            direction = torch.tensor(rng.standard_normal(gaussians[which].shape))
+            values = []
+            for sign in (1, -1):
+                moved = [g.detach().clone() for g in gaussians]
+                moved[which] += sign * step * direction
+                values.append(float(weighted(render(camera, *moved, BACKGROUND))))
+            numeric = (values[0] - values[1]) / (2 * step)
+            analytic = float((gradients[which] * direction).sum())
+            errors.append(abs(numeric - analytic) / (abs(analytic) + 1e-3))
+        assert np.median(errors) < 1e-4, (which, errors)
+
+
+def test_float32_is_close_to_float64():
+    camera = make_camera(64, 48)
+    exact = make_gaussians(400, seed=2)
+    rough = [g.detach().float().requires_grad_() for g in exact]
+    one, other = render(camera, *rough, BACKGROUND.float()), render(camera, *exact, BACKGROUND)
+    # A pixel at the skip level may fall on either side: 1/255 of a colour.
+    assert (one.rgb - other.rgb).abs().mean() < 1e-5
+    assert (one.rgb - other.rgb).abs().max() < 0.01
+
+
+def test_one_gaussian_has_the_analytic_profile():
+    """On the optical axis the variance is (f sigma / z)^2 + 0.3, and the peak is the opacity."""
+    camera = Camera("axis", 41, 41, np.array([[80.0, 0, 20.5], [0, 80.0, 20.5], [0, 0, 1]]), np.eye(4))
+    z, sigma, opacity = 2.0, 0.1, 0.7
+    args = (
+        torch.tensor([[0.0, 0.0, z]]),
+        torch.tensor([sigma]),
+        torch.tensor([opacity]),
+        torch.tensor([[1.0, 0.5, 0.0]]),
+    )
+    picture = render(camera, *(a.double() for a in args), torch.zeros(3).double())
+    variance = (80 * sigma / z) ** 2 + 0.3
+    for dx, dy in [(0, 0), (3, 0), (0, -5), (4, 4)]:
+        expected = opacity * math.exp(-(dx**2 + dy**2) / (2 * variance))
+        assert float(picture.alpha[20 + dy, 20 + dx]) == pytest.approx(expected, rel=1e-6)
+        assert float(picture.rgb[20 + dy, 20 + dx, 1]) == pytest.approx(0.5 * expected, rel=1e-6)
+        assert float(picture.depth[20 + dy, 20 + dx]) == pytest.approx(z, rel=1e-9)
+
+
+def test_crop_is_a_window_of_the_picture():
+    camera = make_camera(60, 50)
+    gaussians = [g.detach() for g in make_gaussians(100, seed=4)]
+    whole = render(camera, *gaussians, BACKGROUND)
+    part = render(camera.cropped(11, 7, 30, 26), *gaussians, BACKGROUND)
+    torch.testing.assert_close(part.rgb, whole.rgb[7:33, 11:41], atol=1e-10, rtol=1e-8)
+
+
+def test_nothing_to_draw():
+    camera = make_camera()
+    behind = torch.tensor([[0.0, 0.0, -50.0]], dtype=torch.float64, requires_grad=True)
+    one = torch.ones(1, dtype=torch.float64)
+    picture = render(camera, behind, 0.1 * one, one, torch.ones(1, 3, dtype=torch.float64), BACKGROUND)
+    assert torch.equal(picture.rgb, BACKGROUND.expand(29, 37, 3))
+    picture.rgb.sum().backward()
+    assert torch.equal(behind.grad, torch.zeros_like(behind))
+
+
+def test_repeats_to_the_bit():
+    def run():
+        gaussians = make_gaussians(500, seed=9, dtype=torch.float32)
+        picture = render(make_camera(80, 70), *gaussians, BACKGROUND.float())
+        weighted(picture).backward()
+        return [picture.rgb.detach(), *(g.grad for g in gaussians)]
+
+    first = run()
+    for _ in range(3):
+        assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
+
+
+def test_non_finite_is_an_error():
+    gaussians = [g.detach().clone() for g in make_gaussians(3)]
+    gaussians[0][1, 2] = float("nan")
+    with pytest.raises(MasivError, match="not finite"):
+        render(make_camera(), *gaussians, BACKGROUND)
