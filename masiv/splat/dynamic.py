@@ -1,0 +1,40 @@
+"""The result of ``reconstruct``: Gaussians at frame 0 and where they go."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from masiv.splat.deformation import DeformationNetwork
+from masiv.splat.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class DynamicGaussians:
+    """canonical: the Gaussians at frame 0; deformation: their displacement and change of size at a time."""
+
+    canonical: Gaussians
+    deformation: DeformationNetwork
+
+    def at(self, time: float) -> Gaussians:
+        """The Gaussians at ``time`` [s], 0 at the first frame; without gradients."""
+        canonical = self.canonical
+        with torch.no_grad():
+            displacement, log_scale = self.deformation(canonical.means, time)
+            scales = canonical.scales * log_scale.exp()
+        return Gaussians(canonical.means + displacement, scales, canonical.opacities, canonical.colours)
+
+    def save(self, folder: Path) -> None:
+        """Write gaussians.ply and deformation.safetensors into ``folder``."""
+        self.canonical.save_ply(Path(folder) / "gaussians.ply")
+        self.deformation.save(Path(folder) / "deformation.safetensors")
+
+    @classmethod
+    def load(cls, folder: Path) -> DynamicGaussians:
+        """Read what ``save`` wrote. Raises InputError where a file is missing or broken."""
+        folder = Path(folder)
+        return cls(
+            Gaussians.load_ply(folder / "gaussians.ply"), DeformationNetwork.load(folder / "deformation.safetensors")
+        )
