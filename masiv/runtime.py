@@ -27,10 +27,15 @@ def start(arch: str = "cpu") -> Any:
     known = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
     if arch not in known:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
-    ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0)
+    ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, verbose=False)
     running = ti.lang.impl.current_cfg().arch
     if arch != "cpu" and running != known[arch]:
         ti.reset()
         raise InputError(f"--arch {arch} is not available on this machine: use --arch cpu")
     _started = arch
     return ti
+
+
+def running_arch() -> str:
+    """The arch that Taichi runs on; cpu where it has not been started."""
+    return _started or "cpu"

@@ -1,0 +1,1 @@
+"""Constitutive laws. One interface for all: ``masiv.materials.law.Law``."""

@@ -1,0 +1,442 @@
+"""One substep of MLS-MPM (APIC, quadratic B-splines) and its hand-written adjoint, on preallocated fields.
+
+Forward (Hu et al. 2018, "A moving least squares material point method"):
+
+    p2g   private[t, i] += w_ip (m v_p + A_p d_ip, m),  A_p = m C_p - dt V 4/dx^2 tau_p,  d_ip = x_i - x_p
+    grid  v_i = momentum_i / m_i + dt g, then contact with the ground plane y = 0
+    g2p   v_p = sum w v_i,  C_p = 4/dx^2 sum w v_i d^T,  x_p += dt v_p,  F_trial = (I + dt C_p) F
+
+The adjoint of P2G is a gather and the adjoint of G2P a scatter, so both directions share two loop shapes. On a CPU each
+chunk of particles scatters into a grid of its own (a float atomic is a compare-and-swap loop there, and its order is not
+reproducible); on a GPU all particles scatter atomically into one grid.
+
+The grid is a window that follows the particles: node (i, j, k) of the lattice dx Z^3 lives at a flat index relative to
+``window_origin``, so the domain is unbounded and memory is that of the object. State fields are allocated by capacity, and
+live counts are kernel arguments: a field's shape is part of a compiled kernel.
+"""
+
+import taichi as ti
+
+STICKY, RELEASE, SLIP, NO_GROUND = 0, 1, 2, 3
+
+# Entries of ``constants``.
+DT, DX, MASS, VOLUME, GRAVITY_X, GRAVITY_Y, GRAVITY_Z, FRICTION, CONSTANT_COUNT = range(9)
+
+NO_FAULT = (1 << 62) - 1
+
+
+@ti.data_oriented
+class MpmKernels:
+    """Memory and kernels. Positions in the simulation frame (y up, ground at y = 0), SI units.
+
+    capacity_steps: substeps whose state is kept at once; capacity_particles, capacity_nodes: upper bounds.
+    """
+
+    def __init__(self, real, capacity_steps: int, capacity_particles: int, capacity_nodes: int, chunks: int, gpu: bool):
+        self.real = real
+        self.capacity_steps = capacity_steps
+        self.capacity_particles = capacity_particles
+        self.capacity_nodes = capacity_nodes
+        self.owner = None  # whose states the fields hold
+        self.gpu = gpu
+        self.chunks = 1 if gpu else chunks
+        stored = (capacity_steps + 1, capacity_particles)
+        self.position = ti.Vector.field(3, real, shape=stored)
+        self.velocity = ti.Vector.field(3, real, shape=stored)
+        self.affine_velocity = ti.Matrix.field(3, 3, real, shape=stored)
+        self.trial_gradient = ti.Matrix.field(3, 3, real, shape=stored)
+        self.deformation_gradient = ti.Matrix.field(3, 3, real, shape=stored)
+        self.kirchhoff_stress = ti.Matrix.field(3, 3, real, shape=stored)
+        self.position_bar = ti.Vector.field(3, real, shape=capacity_particles)
+        self.velocity_bar = ti.Vector.field(3, real, shape=capacity_particles)
+        self.affine_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
+        self.trial_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
+        self.gradient_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
+        self.stress_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
+        self.private = ti.Vector.field(4, real, shape=(self.chunks, capacity_nodes))
+        self.grid_momentum = ti.Vector.field(4, real, shape=capacity_nodes)
+        self.grid_velocity = ti.Vector.field(3, real, shape=capacity_nodes)
+        self.grid_momentum_bar = ti.Vector.field(4, real, shape=capacity_nodes)
+        self.constants = ti.field(real, shape=CONSTANT_COUNT)
+        self.contact = ti.field(ti.i32, shape=())
+        self.window_origin = ti.Vector.field(3, ti.i32, shape=())
+        self.window_shape = ti.Vector.field(3, ti.i32, shape=())
+        self.fault = ti.field(ti.i64, shape=2)  # first (substep << 32 | particle) that broke CFL; that left the window
+
+    # ---- helpers -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def weights(self, fx):
+        """Rows: the three nodes; columns: axes. Quadratic B-spline."""
+        w = ti.Matrix.zero(self.real, 3, 3)
+        for a in ti.static(range(3)):
+            w[0, a] = 0.5 * (1.5 - fx[a]) * (1.5 - fx[a])
+            w[1, a] = 0.75 - (fx[a] - 1.0) * (fx[a] - 1.0)
+            w[2, a] = 0.5 * (fx[a] - 0.5) * (fx[a] - 0.5)
+        return w
+
+    @ti.func
+    def weight_slopes(self, fx):
+        """Derivative of ``weights`` with respect to fx."""
+        g = ti.Matrix.zero(self.real, 3, 3)
+        for a in ti.static(range(3)):
+            g[0, a] = fx[a] - 1.5
+            g[1, a] = -2.0 * (fx[a] - 1.0)
+            g[2, a] = fx[a] - 0.5
+        return g
+
+    @ti.func
+    def add(self, t: ti.i32, node: ti.i32, value):
+        if ti.static(self.gpu):
+            self.private[t, node] += value
+        else:
+            self.private[t, node] = self.private[t, node] + value
+
+    @ti.func
+    def stencil(self, x, dx):
+        """Base node relative to the window, offset of the particle from it in cells, and whether the stencil fits."""
+        scaled = x / dx
+        base = ti.floor(scaled - 0.5, ti.i32)
+        fx = scaled - base
+        local = base - self.window_origin[None]
+        fits = True
+        for a in ti.static(range(3)):
+            if local[a] < 0 or local[a] + 2 >= self.window_shape[None][a]:
+                fits = False
+        return local, fx, fits
+
+    # ---- forward -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def p2g_particle(self, t: ti.i32, s: ti.i32, p: ti.i32):
+        dx, dt, mass = self.constants[DX], self.constants[DT], self.constants[MASS]
+        local, fx, fits = self.stencil(self.position[s, p], dx)
+        if fits:
+            ny, nz = self.window_shape[None][1], self.window_shape[None][2]
+            w = self.weights(fx)
+            affine = (
+                mass * self.affine_velocity[s, p]
+                - (dt * self.constants[VOLUME] * 4.0 / (dx * dx)) * self.kirchhoff_stress[s, p]
+            )
+            corner = mass * self.velocity[s, p] - affine @ (fx * dx)
+            affine *= dx
+            for i in range(3):
+                row = ((local[0] + i) * ny + local[1]) * nz + local[2]
+                wx = w[i, 0]
+                for j, k in ti.static(ti.ndrange(3, 3)):
+                    weight = wx * w[j, 1] * w[k, 2]
+                    momentum = corner + affine @ ti.Vector([i, j, k])
+                    value = weight * ti.Vector([momentum[0], momentum[1], momentum[2], mass])
+                    self.add(t, row + j * nz + k, value)
+        else:
+            ti.atomic_min(self.fault[1], (ti.cast(s, ti.i64) << 32) | p)
+
+    @ti.kernel
+    def p2g(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
+        if ti.static(self.gpu):
+            for n in range(nodes):
+                self.private[0, n] = ti.Vector.zero(self.real, 4)
+            for p in range(count):
+                self.p2g_particle(0, s, p)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.chunks):
+                for n in range(nodes):
+                    self.private[t, n] = ti.Vector.zero(self.real, 4)
+                for p in range(t * count // self.chunks, (t + 1) * count // self.chunks):
+                    self.p2g_particle(t, s, p)
+
+    @ti.func
+    def node_height(self, n: ti.i32):
+        """Lattice index along y of node n; the ground plane is at 0."""
+        return self.window_origin[None][1] + (n // self.window_shape[None][2]) % self.window_shape[None][1]
+
+    @ti.func
+    def free_velocity(self, value):
+        """Velocity of a node after gravity, before contact. value: (momentum, mass) with mass > 0."""
+        gravity = ti.Vector([self.constants[GRAVITY_X], self.constants[GRAVITY_Y], self.constants[GRAVITY_Z]])
+        return ti.Vector([value[0], value[1], value[2]]) / value[3] + self.constants[DT] * gravity
+
+    @ti.kernel
+    def grid_update(self, nodes: ti.i32):
+        for n in range(nodes):
+            value = self.private[0, n]
+            for t in ti.static(range(1, self.chunks)):
+                value += self.private[t, n]
+            self.grid_momentum[n] = value
+            v = ti.Vector.zero(self.real, 3)
+            if value[3] > 0.0:
+                v = self.free_velocity(value)
+                if self.contact[None] != NO_GROUND and self.node_height(n) <= 0:
+                    v = self.contact_velocity(v)
+            self.grid_velocity[n] = v
+
+    @ti.func
+    def contact_velocity(self, v):
+        """Velocity of a node on or below the ground after contact. Friction is Coulomb's, for ``SLIP``."""
+        out = v
+        if self.contact[None] == STICKY:
+            out = ti.Vector.zero(self.real, 3)
+        elif v[1] < 0.0:
+            if self.contact[None] == RELEASE:
+                out = ti.Vector.zero(self.real, 3)
+            else:
+                tangent = ti.Vector([v[0], 0.0, v[2]])
+                speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
+                kept = ti.cast(0.0, self.real)
+                if speed > -self.constants[FRICTION] * v[1]:
+                    kept = 1.0 + self.constants[FRICTION] * v[1] / speed
+                out = kept * tangent
+        return out
+
+    @ti.func
+    def g2p_particle(self, s: ti.i32, p: ti.i32):
+        dx, dt = self.constants[DX], self.constants[DT]
+        x = self.position[s, p]
+        local, fx, fits = self.stencil(x, dx)
+        if fits:
+            ny, nz = self.window_shape[None][1], self.window_shape[None][2]
+            w = self.weights(fx)
+            v = ti.Vector.zero(self.real, 3)
+            b = ti.Matrix.zero(self.real, 3, 3)  # sum w v_i (i, j, k)^T, in cells from the stencil's corner
+            for i in range(3):
+                row = ((local[0] + i) * ny + local[1]) * nz + local[2]
+                wx = w[i, 0]
+                for j, k in ti.static(ti.ndrange(3, 3)):
+                    wv = (wx * w[j, 1] * w[k, 2]) * self.grid_velocity[row + j * nz + k]
+                    v += wv
+                    for a in ti.static(range(3)):
+                        b[a, 0] += wv[a] * i
+                        b[a, 1] += wv[a] * j
+                        b[a, 2] += wv[a] * k
+            affine = (4.0 / dx) * (b - v.outer_product(fx))
+            if not v.norm() * dt < dx:  # also true for NaN
+                ti.atomic_min(self.fault[0], (ti.cast(s, ti.i64) << 32) | p)
+            self.velocity[s + 1, p] = v
+            self.affine_velocity[s + 1, p] = affine
+            self.position[s + 1, p] = x + dt * v
+            f = self.deformation_gradient[s, p]
+            self.trial_gradient[s + 1, p] = f + dt * (affine @ f)
+
+    @ti.kernel
+    def g2p(self, s: ti.i32, count: ti.i32):
+        for p in range(count):
+            self.g2p_particle(s, p)
+
+    @ti.kernel
+    def bounds(self, s: ti.i32, count: ti.i32) -> ti.types.vector(7, ti.f64):
+        """Lower corner, upper corner [m] and the largest speed [m/s] of the particles at substep s."""
+        out = ti.Vector([1e30, 1e30, 1e30, -1e30, -1e30, -1e30, 0.0], dt=ti.f64)
+        for p in range(count):
+            for a in ti.static(range(3)):
+                ti.atomic_min(out[a], ti.cast(self.position[s, p][a], ti.f64))
+                ti.atomic_max(out[3 + a], ti.cast(self.position[s, p][a], ti.f64))
+            ti.atomic_max(out[6], ti.cast(self.velocity[s, p].norm(), ti.f64))
+        return out
+
+    @ti.kernel
+    def clear_fault(self):
+        for i in ti.static(range(2)):
+            self.fault[i] = ti.i64(NO_FAULT)
+
+    def read_fault(self):
+        """(too fast, outside of the window): each substep << 32 | particle, or -1."""
+        return tuple(-1 if self.fault[i] == NO_FAULT else self.fault[i] for i in range(2))
+
+    @ti.kernel
+    def set_window(self, ox: ti.i32, oy: ti.i32, oz: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
+        self.window_origin[None] = ti.Vector([ox, oy, oz])
+        self.window_shape[None] = ti.Vector([nx, ny, nz])
+
+    # ---- adjoint -------------------------------------------------------------------------------------------------
+    # ``*_bar`` hold the adjoint of the state after substep s; each kernel replaces them by that before it.
+
+    @ti.func
+    def g2p_adjoint_particle(self, t: ti.i32, s: ti.i32, p: ti.i32):
+        dx, dt = self.constants[DX], self.constants[DT]
+        local, fx, _ = self.stencil(self.position[s, p], dx)
+        ny, nz = self.window_shape[None][1], self.window_shape[None][2]
+        w, g = self.weights(fx), self.weight_slopes(fx)
+        trial_bar = self.trial_bar[p]
+        affine = self.affine_velocity[s + 1, p]
+        v_bar = self.velocity_bar[p] + dt * self.position_bar[p]
+        c_bar = self.affine_bar[p] + dt * (trial_bar @ self.deformation_gradient[s, p].transpose())
+        self.gradient_bar[p] = trial_bar + dt * (affine.transpose() @ trial_bar)
+        # v_i gets w (v_bar + 4/dx^2 C_bar d_ip); written from the stencil's corner, in cells.
+        slope = (4.0 / dx) * c_bar
+        corner = v_bar - slope @ fx
+        x_bar = ti.Vector.zero(self.real, 3)
+        v_sum = ti.Vector.zero(self.real, 3)
+        for i in range(3):
+            row = ((local[0] + i) * ny + local[1]) * nz + local[2]
+            wx, gx = w[i, 0], g[i, 0]
+            for j, k in ti.static(ti.ndrange(3, 3)):
+                node = row + j * nz + k
+                weight = wx * w[j, 1] * w[k, 2]
+                vi = self.grid_velocity[node]
+                push = corner + slope @ ti.Vector([i, j, k])
+                value = weight * push
+                self.add(t, node, ti.Vector([value[0], value[1], value[2], 0.0]))
+                along = vi.dot(push)
+                x_bar += along * ti.Vector(
+                    [gx * w[j, 1] * w[k, 2], wx * g[j, 1] * w[k, 2], wx * w[j, 1] * g[k, 2]]
+                )
+                v_sum += weight * vi
+        self.position_bar[p] += (x_bar - slope.transpose() @ v_sum) / dx
+
+    @ti.kernel
+    def g2p_adjoint(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
+        if ti.static(self.gpu):
+            for n in range(nodes):
+                self.private[0, n] = ti.Vector.zero(self.real, 4)
+            for p in range(count):
+                self.g2p_adjoint_particle(0, s, p)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.chunks):
+                for n in range(nodes):
+                    self.private[t, n] = ti.Vector.zero(self.real, 4)
+                for p in range(t * count // self.chunks, (t + 1) * count // self.chunks):
+                    self.g2p_adjoint_particle(t, s, p)
+
+    @ti.kernel
+    def grid_adjoint(self, nodes: ti.i32):
+        for n in range(nodes):
+            sums = self.private[0, n]
+            for t in ti.static(range(1, self.chunks)):
+                sums += self.private[t, n]
+            out = ti.Vector.zero(self.real, 4)
+            value = self.grid_momentum[n]
+            if value[3] > 0.0:
+                bar = ti.Vector([sums[0], sums[1], sums[2]])
+                if self.contact[None] != NO_GROUND and self.node_height(n) <= 0:
+                    bar = self.contact_adjoint(self.free_velocity(value), bar)
+                momentum = ti.Vector([value[0], value[1], value[2]])
+                out = ti.Vector([bar[0], bar[1], bar[2], -bar.dot(momentum) / value[3]]) / value[3]
+            self.grid_momentum_bar[n] = out
+
+    @ti.func
+    def contact_adjoint(self, v, bar):
+        """Adjoint of ``contact_velocity`` at v."""
+        out = bar
+        if self.contact[None] == STICKY:
+            out = ti.Vector.zero(self.real, 3)
+        elif v[1] < 0.0:
+            out = ti.Vector.zero(self.real, 3)
+            if self.contact[None] == SLIP:
+                mu = self.constants[FRICTION]
+                speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
+                if speed > -mu * v[1]:
+                    along = (bar[0] * v[0] + bar[2] * v[2]) / speed
+                    kept = 1.0 + mu * v[1] / speed
+                    turn = -mu * v[1] * along / (speed * speed)
+                    out = ti.Vector([kept * bar[0] + turn * v[0], mu * along, kept * bar[2] + turn * v[2]])
+        return out
+
+    @ti.kernel
+    def p2g_adjoint(self, s: ti.i32, count: ti.i32):
+        for p in range(count):
+            dx, dt, mass = self.constants[DX], self.constants[DT], self.constants[MASS]
+            local, fx, _ = self.stencil(self.position[s, p], dx)
+            ny, nz = self.window_shape[None][1], self.window_shape[None][2]
+            w, g = self.weights(fx), self.weight_slopes(fx)
+            stress_factor = dt * self.constants[VOLUME] * 4.0 / (dx * dx)
+            affine = mass * self.affine_velocity[s, p] - stress_factor * self.kirchhoff_stress[s, p]
+            corner = mass * self.velocity[s, p] - affine @ (fx * dx)
+            v_bar = ti.Vector.zero(self.real, 3)
+            b = ti.Matrix.zero(self.real, 3, 3)
+            x_bar = ti.Vector.zero(self.real, 3)
+            for i in range(3):
+                row = ((local[0] + i) * ny + local[1]) * nz + local[2]
+                wx, gx = w[i, 0], g[i, 0]
+                for j, k in ti.static(ti.ndrange(3, 3)):
+                    bar = self.grid_momentum_bar[row + j * nz + k]
+                    push = ti.Vector([bar[0], bar[1], bar[2]])
+                    momentum = corner + dx * (affine @ ti.Vector([i, j, k]))
+                    along = momentum.dot(push) + mass * bar[3]
+                    x_bar += along * ti.Vector(
+                        [gx * w[j, 1] * w[k, 2], wx * g[j, 1] * w[k, 2], wx * w[j, 1] * g[k, 2]]
+                    )
+                    wp = (wx * w[j, 1] * w[k, 2]) * push
+                    v_bar += wp
+                    for a in ti.static(range(3)):
+                        b[a, 0] += wp[a] * i
+                        b[a, 1] += wp[a] * j
+                        b[a, 2] += wp[a] * k
+            affine_bar = dx * (b - v_bar.outer_product(fx))
+            self.position_bar[p] += x_bar / dx - affine.transpose() @ v_bar
+            self.velocity_bar[p] = mass * v_bar
+            self.affine_bar[p] = mass * affine_bar
+            self.stress_bar[p] = -stress_factor * affine_bar
+
+    # ---- to and from torch ---------------------------------------------------------------------------------------
+
+    @ti.kernel
+    def write_state(
+        self,
+        s: ti.i32,
+        position: ti.types.ndarray(),
+        velocity: ti.types.ndarray(),
+        affine: ti.types.ndarray(),
+        trial: ti.types.ndarray(),
+    ):
+        for p in range(position.shape[0]):
+            for a in ti.static(range(3)):
+                self.position[s, p][a] = position[p, a]
+                self.velocity[s, p][a] = velocity[p, a]
+                for b in ti.static(range(3)):
+                    self.affine_velocity[s, p][a, b] = affine[p, a, b]
+                    self.trial_gradient[s, p][a, b] = trial[p, a, b]
+
+    @ti.kernel
+    def read_state(
+        self,
+        s: ti.i32,
+        position: ti.types.ndarray(),
+        velocity: ti.types.ndarray(),
+        affine: ti.types.ndarray(),
+        trial: ti.types.ndarray(),
+    ):
+        for p in range(position.shape[0]):
+            for a in ti.static(range(3)):
+                position[p, a] = self.position[s, p][a]
+                velocity[p, a] = self.velocity[s, p][a]
+                for b in ti.static(range(3)):
+                    affine[p, a, b] = self.affine_velocity[s, p][a, b]
+                    trial[p, a, b] = self.trial_gradient[s, p][a, b]
+
+    @ti.kernel
+    def read_position(self, s: ti.i32, position: ti.types.ndarray()):
+        for p in range(position.shape[0]):
+            for a in ti.static(range(3)):
+                position[p, a] = self.position[s, p][a]
+
+    @ti.kernel
+    def add_position_bar(self, bar: ti.types.ndarray()):
+        for p in range(bar.shape[0]):
+            for a in ti.static(range(3)):
+                self.position_bar[p][a] += bar[p, a]
+
+    @ti.kernel
+    def clear_bars(self, count: ti.i32):
+        for p in range(count):
+            self.position_bar[p] = ti.Vector.zero(self.real, 3)
+            self.velocity_bar[p] = ti.Vector.zero(self.real, 3)
+            self.affine_bar[p] = ti.Matrix.zero(self.real, 3, 3)
+            self.trial_bar[p] = ti.Matrix.zero(self.real, 3, 3)
+
+    @ti.kernel
+    def read_bars(
+        self,
+        position: ti.types.ndarray(),
+        velocity: ti.types.ndarray(),
+        affine: ti.types.ndarray(),
+        trial: ti.types.ndarray(),
+    ):
+        for p in range(position.shape[0]):
+            for a in ti.static(range(3)):
+                position[p, a] = self.position_bar[p][a]
+                velocity[p, a] = self.velocity_bar[p][a]
+                for b in ti.static(range(3)):
+                    affine[p, a, b] = self.affine_bar[p][a, b]
+                    trial[p, a, b] = self.trial_bar[p][a, b]

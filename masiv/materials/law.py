@@ -1,0 +1,57 @@
+"""The interface of every constitutive law."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+if TYPE_CHECKING:
+    from masiv.kernels.mpm import MpmKernels
+
+
+class BoundLaw(ABC):
+    """A law attached to the memory of a simulator. Created by ``Law.bind`` for one rollout."""
+
+    @abstractmethod
+    def forward(self, s: int, count: int) -> None:
+        """Trial gradient at substep s -> elastic deformation gradient and Kirchhoff stress at s."""
+
+    @abstractmethod
+    def backward(self, s: int, count: int) -> None:
+        """``gradient_bar``, ``stress_bar`` -> ``trial_bar`` at substep s; parameter gradients are summed up."""
+
+    @abstractmethod
+    def parameter_gradients(self) -> tuple[torch.Tensor | None, ...]:
+        """Gradients with respect to ``Law.parameters()``, in that order, since the binding."""
+
+
+class Law(torch.nn.Module, ABC):
+    """Elastic stress and plastic flow of a material.
+
+    ``project`` and ``stress`` are pointwise and differentiable torch functions: the definition of the law, in any dtype.
+    ``bind`` gives the fast equivalent on the fields of a simulator.
+    """
+
+    kind: str
+
+    @abstractmethod
+    def project(self, trial_gradient: torch.Tensor, dt: float) -> torch.Tensor:
+        """Return mapping: trial elastic deformation gradient (N, 3, 3) -> elastic deformation gradient (N, 3, 3)."""
+
+    @abstractmethod
+    def stress(self, deformation_gradient: torch.Tensor) -> torch.Tensor:
+        """Elastic deformation gradient (N, 3, 3) -> Kirchhoff stress (N, 3, 3) [Pa]."""
+
+    @abstractmethod
+    def wave_modulus(self) -> float:
+        """P-wave modulus lambda + 2 mu at rest [Pa]: sets the speed of sound, hence the substep."""
+
+    @abstractmethod
+    def bind(self, kernels: MpmKernels, count: int, dt: float) -> BoundLaw:
+        """Attach to the fields of a simulator with ``count`` live particles and substep dt [s]."""
+
+    @abstractmethod
+    def description(self) -> dict[str, Any]:
+        """What ``twin.yaml`` says of the law: kind and readable parameters with units."""
