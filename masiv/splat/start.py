@@ -1,0 +1,81 @@
+"""Where the fit starts: Gaussians on the first frame's hull, and how each frame's hull has moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from masiv.continuum.carve import VisualHull, visual_hull
+from masiv.errors import MasivError
+from masiv.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Start:
+    """means (N, 3) [m]; scale [m]; colours (N, 3) in [0, 1]; centre (3,) and half_extent [m] of the first hull;
+    base_motion (T, 3) [m], centroids of the hulls relative to frame 0."""
+
+    means: np.ndarray
+    scale: float
+    colours: np.ndarray
+    centre: np.ndarray
+    half_extent: float
+    base_motion: np.ndarray
+
+
+def starting_point(scene: Scene, count: int, resolution: int, rng: np.random.Generator) -> Start:
+    """Start from the visual hulls of ``scene``. Raises MasivError where a hull is empty, as ``visual_hull`` does."""
+    hull = visual_hull(scene, 0, resolution=resolution)
+    centroids = [hull.points.mean(axis=0)]
+    for frame in range(1, scene.frame_count):
+        centroids.append(visual_hull(scene, frame, resolution=max(8, resolution // 2)).points.mean(axis=0))
+    shell = hull.points[hull.surface]
+    if len(shell) < 2:
+        raise MasivError(f"the visual hull of frame 0 of {scene.path} is a single voxel: raise hull_resolution")
+    area = len(shell) * hull.spacing**2
+    chosen = np.sort(rng.permutation(len(shell))[: min(count, len(shell))])
+    means = shell[chosen] + rng.uniform(-0.25, 0.25, (len(chosen), 3)) * hull.spacing
+    low, high = hull.points.min(axis=0), hull.points.max(axis=0)
+    return Start(
+        means=means,
+        scale=0.6 * float(np.sqrt(area / len(means))),
+        colours=_colours(scene, hull, means),
+        centre=(low + high) / 2,
+        half_extent=float((high - low).max() / 2 + hull.spacing),
+        base_motion=np.stack(centroids) - centroids[0],
+    )
+
+
+def _colours(scene: Scene, hull: VisualHull, means: np.ndarray) -> np.ndarray:
+    """Mean colour (N, 3) of each point over the views of frame 0 where it is in front; grey where no view has it.
+
+    A point is in front where it is no deeper than two voxels behind the nearest point of the hull in its pixel.
+    """
+    total, weight = np.zeros((len(means), 3)), np.zeros(len(means))
+    shell = hull.points[hull.surface]
+    for view in scene.views:
+        camera, picture = scene.cameras[view], scene.frame(view, 0)
+        nearest = np.full((camera.height + 2, camera.width + 2), np.inf)
+        row, column, depth = _pixels(camera, shell)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                target = (np.clip(row + dy, -1, camera.height) + 1, np.clip(column + dx, -1, camera.width) + 1)
+                np.minimum.at(nearest, target, depth)
+        row, column, depth = _pixels(camera, means)
+        inside = (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width) & (depth > 0)
+        index = np.flatnonzero(inside)
+        row, column = row[index], column[index]
+        in_front = depth[index] <= nearest[row + 1, column + 1] + 2 * hull.spacing
+        share = picture.mask[row, column] * picture.valid[row, column] * in_front
+        total[index] += share[:, None] * picture.image[row, column] / 255
+        weight[index] += share
+    return np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-9)[:, None], 0.5)
+
+
+def _pixels(camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pixels, depth = camera.project(points)
+    pixels = np.where((depth > 0)[:, None], pixels, -1.0)
+    limit = [camera.width, camera.height]
+    whole = np.clip(np.floor(pixels), -1, limit).astype(np.int64)
+    return whole[:, 1], whole[:, 0], depth
