@@ -1,0 +1,88 @@
+"""What a motion of the continuum must answer to. All are means of squares, lengths in particle spacings."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from masiv.continuum.silhouette import silhouettes
+from masiv.scene.scene import Ground, Scene
+
+_LARGEST_SIDE = 256
+"""Signed distances are smooth: larger pictures are reduced to this many pixels."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One mask for torch: distance (H, W) [pixels] to its edge, pose (3, 4) and pinhole (3, 3)."""
+
+    distance: torch.Tensor
+    pose: torch.Tensor
+    pinhole: torch.Tensor
+
+
+def load_views(scene: Scene) -> list[list[View]]:
+    """The masks that ``scene`` may look at, as a list over frames of lists over views."""
+    return [[_view(s) for s in silhouettes(scene, frame)] for frame in range(scene.frame_count)]
+
+
+def _view(silhouette) -> View:
+    # Where an occluder hides the scene the mask rules nothing out.
+    distance = np.where(silhouette.valid, silhouette.distance, np.minimum(silhouette.distance, 0.0)).astype(np.float32)
+    height, width = distance.shape
+    factor = math.ceil(max(height, width) / _LARGEST_SIDE)
+    pinhole = silhouette.camera.intrinsics.copy()
+    if factor > 1:
+        rows, columns = height // factor, width // factor
+        distance = cv2.resize(distance, (columns, rows), interpolation=cv2.INTER_AREA) * (columns / width)
+        pinhole[0] *= columns / width
+        pinhole[1] *= rows / height
+    pose = torch.as_tensor(silhouette.camera.world_to_camera[:3], dtype=torch.float32)
+    return View(torch.as_tensor(distance, dtype=torch.float32), pose, torch.as_tensor(pinhole, dtype=torch.float32))
+
+
+def outside_of_mask(positions: torch.Tensor, view: View) -> torch.Tensor:
+    """World points (N, 3) [m] -> how far outside of the mask (N,) [m], 0 inside it or out of the picture."""
+    in_camera = positions @ view.pose[:, :3].T + view.pose[:, 3]
+    depth = in_camera[:, 2].clamp(min=1e-3)
+    pixels = (in_camera @ view.pinhole.T)[:, :2] / depth[:, None]
+    size = pixels.new_tensor([view.distance.shape[1], view.distance.shape[0]])
+    grid = 2 * pixels / size - 1
+    distance = torch.nn.functional.grid_sample(
+        view.distance[None, None], grid[None, None], align_corners=False, padding_mode="border"
+    )[0, 0, 0]
+    shown = (grid.detach().abs() < 1).all(dim=1) & (in_camera.detach()[:, 2] > 1e-3)
+    return torch.where(shown, distance.clamp(min=0) * depth / view.pinhole[0, 0], 0.0)
+
+
+def below_ground(positions: torch.Tensor, ground: Ground) -> torch.Tensor:
+    """World points (..., 3) [m] -> depth below the plane (...) [m], 0 above it."""
+    normal = torch.as_tensor(ground.normal, dtype=positions.dtype)
+    return (ground.height - positions @ normal).clamp(min=0)
+
+
+def stencil(centres: torch.Tensor, step: float) -> torch.Tensor:
+    """Points (N, 3) -> (7 N, 3): each centre, then its neighbours at ±``step`` along x, y, z."""
+    offsets = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).to(centres) * step
+    return (centres[None] + offsets[:, None]).reshape(-1, 3)
+
+
+def field_terms(displacements: torch.Tensor, step: float) -> dict[str, torch.Tensor]:
+    """Displacements (T, 7 N, 3) [m] on a ``stencil`` -> smoothness, volume, rigidity.
+
+    F = I + ∂d/∂x by central differences; volume (det F - 1)², rigidity |FᵀF - I|², smoothness second differences/step.
+    """
+    d = displacements.reshape(len(displacements), 7, -1, 3)
+    middle, ahead, behind = d[:, :1], d[:, 1:4], d[:, 4:7]
+    columns = (ahead - behind) / (2 * step)
+    gradient = torch.eye(3).to(d) + columns.permute(0, 2, 3, 1)
+    strain = gradient.mT @ gradient - torch.eye(3).to(d)
+    return {
+        "smoothness": ((ahead + behind - 2 * middle) / step).square().sum(-1).mean(),
+        "volume": (torch.linalg.det(gradient) - 1).square().mean(),
+        "rigidity": strain.square().sum((-1, -2)).mean(),
+    }

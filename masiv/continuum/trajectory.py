@@ -1,0 +1,142 @@
+"""Dense motion of the filled continuum (MASIV, section "Continuum Trajectory Estimation").
+
+The particles that fill frame 0 are carried by a copy of the motion network that the pictures trained; the network, not
+the particles, is fine-tuned until they fill every other frame. d(x, 0) = 0 by construction, so frame 0 stays put.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from masiv.checkpoint import Checkpoint
+from masiv.continuum.config import TrajectoryConfig
+from masiv.continuum.consistency import consistent_particles
+from masiv.continuum.fill import FilledVolume, density_field, even_points, fill_volume
+from masiv.continuum.finetune import fine_tune
+from masiv.errors import InputError, MasivError
+from masiv.progress import Progress, silent
+from masiv.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from masiv.splat.deformation import DeformationNetwork
+    from masiv.splat.dynamic import DynamicGaussians
+
+_CHUNK = 8
+"""Times evaluated at once: bounds the memory of long queries."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Motion of the continuum.
+
+    positions (T, Q, 3) float32 [m, world] at times (T,) [s]; positions[0] is the canonical frame. spacing [m]: a
+    particle stands for spacing³; volume = Q spacing³ [m³]; ``network`` knows the motion between the frames.
+    """
+
+    positions: np.ndarray
+    times: np.ndarray
+    spacing: float
+    volume: float
+    network: DeformationNetwork
+
+    def evaluate(self, times: np.ndarray) -> np.ndarray:
+        """Positions (K, Q, 3) float32 [m] at any ``times`` (K,) [s] within the observed span."""
+        return carry(self.network, self.positions[0], times)
+
+    def save(self, path: Path) -> None:
+        """Write ``path`` (.npz): positions, times, spacing, volume and the network; complete or not at all."""
+        weights = {f"network/{name}": value.detach().numpy() for name, value in self.network.state_dict().items()}
+        temporary = path.with_suffix(".tmp.npz")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(
+            temporary,
+            positions=self.positions,
+            times=self.times,
+            spacing=self.spacing,
+            volume=self.volume,
+            network_settings=json.dumps(self.network.settings),
+            **weights,
+        )
+        os.replace(temporary, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Trajectory:
+        """Read what ``save`` wrote. Raises InputError where ``path`` is missing or is something else."""
+        import torch
+
+        from masiv.splat.deformation import DeformationNetwork
+
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                weights = {
+                    n.removeprefix("network/"): torch.from_numpy(file[n]) for n in file if n.startswith("network/")
+                }
+                settings = json.loads(str(file["network_settings"]))
+                network = DeformationNetwork(
+                    centre=weights["centre"], base_motion=weights["base_motion"], **settings
+                ).requires_grad_(False)
+                network.load_state_dict(weights)
+                return cls(file["positions"], file["times"], float(file["spacing"]), float(file["volume"]), network)
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+            raise InputError(f"{path} is not a trajectory saved by masiv ({error}); run masiv trajectory") from error
+
+
+def estimate_trajectory(
+    scene: Scene,
+    dynamic: DynamicGaussians,
+    config: TrajectoryConfig,
+    *,
+    seed: int = 0,
+    checkpoint: Checkpoint | None = None,
+    progress: Progress = silent,
+) -> Trajectory:
+    """Fill frame 0 and follow its particles through every frame that ``scene`` may look at.
+
+    Raises MasivError where a frame leaves nothing to fill or the motion becomes non-finite.
+    """
+    checkpoint = checkpoint or Checkpoint(None)
+    start = fill_start(scene, dynamic, config)
+    volumes = []
+    for frame in range(1, scene.frame_count):
+        progress("fill", frame, scene.frame_count - 1)
+        volumes.append(fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing))
+    network = fine_tune(scene, dynamic, start, volumes, config, seed=seed, checkpoint=checkpoint, progress=progress)
+    positions = carry(network, start.points, scene.times)
+    if not np.isfinite(positions).all():
+        raise MasivError("trajectory: the motion became non-finite; lower trajectory.learning_rate")
+    return Trajectory(positions, scene.times, start.spacing, start.volume, network)
+
+
+def fill_start(scene: Scene, dynamic: DynamicGaussians, config: TrajectoryConfig) -> FilledVolume:
+    """The canonical continuum: frame 0 filled, less what its own motion carries out of the masks of later frames.
+
+    Carving across time gives a static hull as many silhouettes as there are frames: the corners of the hull that no
+    camera sees at frame 0 stick out once the object has turned or touched the ground.
+    """
+    field = density_field(scene, dynamic, 0, config)
+    solid = np.argwhere(field.density > 0.5)
+    voxels = field.lower + field.spacing * solid
+    kept = consistent_particles(scene, dynamic.deformation, voxels, field.spacing, config)
+    field.density[tuple(solid[~kept].T)] = 0.0
+    if not kept.any():
+        raise MasivError("trajectory: the motion carries the object out of its masks; run reconstruct for longer")
+    spacing = (field.volume / config.particle_count) ** (1 / 3)
+    points = even_points(field, spacing)
+    return FilledVolume(points, spacing, len(points) * spacing**3)
+
+
+def carry(network: DeformationNetwork, start: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Frame-0 points (Q, 3) [m] at ``times`` (K,) [s] -> (K, Q, 3) float32 [m]."""
+    import torch
+
+    points = torch.as_tensor(np.asarray(start), dtype=torch.float32)
+    times = torch.as_tensor(np.asarray(times), dtype=torch.float32)
+    with torch.no_grad():
+        moved = [points + network.displacements(points, chunk) for chunk in times.split(_CHUNK)]
+    return torch.cat(moved).numpy()
