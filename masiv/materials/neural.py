@@ -25,7 +25,7 @@ from masiv.materials.law import BoundLaw, Law
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
 
-STRAIN_SCALE = 0.02  # strains well below are resolved linearly, above logarithmically
+STRAIN_SCALE = 0.02
 LOG_MODULUS_RANGE = 6.0
 LOG_RATE_RANGE = 14.0  # relaxation rates of e^-14 to e^14 per second
 
@@ -40,9 +40,10 @@ def strain_invariants(deformation_gradient: torch.Tensor) -> torch.Tensor:
 
 
 class NeuralLaw(Law):
-    """Two networks 3 -> width -> width -> coefficients, and a stress scale [Pa] (learnt as its logarithm).
+    """Two networks 3 -> width -> width -> coefficients, and two scales learnt as logarithms.
 
-    The elastic network gives log moduli relative to the scale, the plastic one log relaxation rates [1/s].
+    The elastic network gives log moduli relative to the stress scale [Pa], the plastic one log relaxation rates [1/s] of
+    strains relative to the flow strain: moving the two scales makes another stiffness and another yield strain of one kind.
     """
 
     kind = "neural"
@@ -54,25 +55,29 @@ class NeuralLaw(Law):
         self.elastic = _network(width, 4, generator)
         self.plastic = _network(width, 2, generator)
         self.log_stress_scale = torch.nn.Parameter(torch.tensor(math.log(stress_scale)))
+        self.log_flow_strain = torch.nn.Parameter(torch.tensor(math.log(STRAIN_SCALE)))
 
     @staticmethod
-    def features(invariants: torch.Tensor) -> torch.Tensor:
-        """Invariants (N, 3) -> network inputs (N, 3): volume, size of the shear, and its kind (tension or compression)."""
+    def features(invariants: torch.Tensor, strain: torch.Tensor | float) -> torch.Tensor:
+        """Invariants (N, 3) -> network inputs (N, 3): volume, size of the shear, and its kind (tension or compression).
+
+        Strains well below ``strain`` are seen linearly, those above logarithmically.
+        """
         volume, first, second = invariants.unbind(1)
-        scale = STRAIN_SCALE**2
-        size = torch.log1p((first + second).clamp_min(-0.5 * scale) / scale)
-        sort = (second - first) / (first + second + scale)
-        return torch.stack([torch.asinh(volume / STRAIN_SCALE), 0.5 * size, sort], dim=1)
+        square = strain**2
+        size = torch.log1p(torch.relu(first + second) / square)
+        sort = (second - first) / (first + second + square)
+        return torch.stack([torch.asinh(volume / strain), 0.5 * size, sort], dim=1)
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
         """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
-        raw = self.elastic(self.features(invariants))
+        raw = self.elastic(self.features(invariants, STRAIN_SCALE))
         bounded = LOG_MODULUS_RANGE * torch.tanh(raw[:, :3] / LOG_MODULUS_RANGE)
         return torch.exp(self.log_stress_scale) * torch.cat([torch.exp(bounded), torch.tanh(raw[:, 3:])], dim=1)
 
     def flow_share(self, invariants: torch.Tensor, dt: float) -> torch.Tensor:
         """Shares (N, 2) of the isochoric and volumetric elastic strain that flow within dt [s]."""
-        raw = self.plastic(self.features(invariants))
+        raw = self.plastic(self.features(invariants, torch.exp(self.log_flow_strain)))
         rate = torch.exp(LOG_RATE_RANGE * torch.tanh(raw / LOG_RATE_RANGE))
         return -torch.expm1(-dt * rate)
 

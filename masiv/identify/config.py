@@ -1,0 +1,29 @@
+"""Settings of the identify stage. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class IdentifyConfig(BaseModel):
+    """Initial velocity, ground and law. Lengths in metres; weights multiply mean errors in units of the object's size."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    start: Literal["auto", "jelly", "plasticine", "sand", "water"] = Field(
+        "auto", description="pretrained law to start from; auto takes the one that explains the motion best"
+    )
+    contact: Literal["auto", "sticky", "release", "slip"] = Field("auto", description="how the ground holds the body")
+    search_particles: int = Field(1000, ge=100, description="particles of the rollouts that choose the start")
+    iterations: int = Field(120, ge=0, description="rollouts of the joint fit")
+    samples_per_frame: int = Field(2, ge=1, le=16, description="instants per frame at which trajectories are compared")
+    law_learning_rate: float = Field(4e-3, gt=0, description="step of the network weights")
+    scale_learning_rate: float = Field(0.06, gt=0, description="step of the logarithms of stress and strain scale")
+    velocity_learning_rate: float = Field(0.01, gt=0, description="step of velocity [m/s] and spin [rad/s]")
+    ground_learning_rate: float = Field(1e-3, gt=0, description="step of the ground's height [m]")
+    ground_range: float = Field(0.03, ge=0, description="the effective ground may lie this far from the scene's [m]")
+    trajectory_weight: float = Field(1.0, ge=0)
+    silhouette_weight: float = Field(0.2, ge=0)
+    silhouette_pictures: int = Field(4, ge=0, description="pictures whose silhouette is compared in an iteration")
