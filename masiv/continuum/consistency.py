@@ -12,7 +12,7 @@ from masiv.splat.deformation import DeformationNetwork
 
 
 def consistent_particles(
-    scene: Scene, network: DeformationNetwork, points: np.ndarray, spacing: float, config: TrajectoryConfig
+    scene: Scene, network: DeformationNetwork, points: np.ndarray, config: TrajectoryConfig
 ) -> np.ndarray:
     """Which frame-0 points (M, 3) [m] their motion keeps inside of the object, (M,) bool.
 

@@ -122,7 +122,7 @@ def fill_start(scene: Scene, dynamic: DynamicGaussians, config: TrajectoryConfig
     field = density_field(scene, dynamic, 0, config)
     solid = np.argwhere(field.density > 0.5)
     voxels = field.lower + field.spacing * solid
-    kept = consistent_particles(scene, dynamic.deformation, voxels, field.spacing, config)
+    kept = consistent_particles(scene, dynamic.deformation, voxels, config)
     field.density[tuple(solid[~kept].T)] = 0.0
     if not kept.any():
         raise MasivError("trajectory: the motion carries the object out of its masks; run reconstruct for longer")
