@@ -1,0 +1,138 @@
+"""What a command says: text or one JSON object on stdout; progress and errors on stderr; the exit code."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from typing import Any
+
+import typer
+
+from masiv.errors import InputError, MasivError
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+PLAIN_EVERY_S = 15.0
+
+
+def command(function: Callable[..., tuple[dict[str, Any], str]]) -> Callable[..., None]:
+    """Make a typer command of a function that returns (what --json prints, what a person reads).
+
+    Its parameter ``as_json`` says which of the two. MasivError ends with one sentence and exit code 1,
+    InputError with 2.
+    """
+
+    @functools.wraps(function)
+    def wrapped(*args: Any, **kwargs: Any) -> None:
+        as_json = bool(kwargs.get("as_json"))
+        try:
+            with _quiet_stdout(as_json):
+                data, text = function(*args, **kwargs)
+        except MasivError as error:
+            fail(str(error), BAD_INPUT if isinstance(error, InputError) else FAILED, as_json)
+        except KeyboardInterrupt:
+            fail("interrupted; the same command goes on from the last checkpoint", INTERRUPTED, as_json)
+        except Exception as error:
+            import traceback
+
+            traceback.print_exc()
+            fail(
+                f"unexpected {type(error).__name__}: {error}; this is a bug, please report the lines above",
+                FAILED,
+                as_json,
+            )
+        else:
+            if as_json:
+                from masiv.runfolder import plain
+
+                text = json.dumps(plain(data), allow_nan=False)
+            print(text)
+
+    return wrapped
+
+
+def fail(message: str, code: int, as_json: bool) -> None:
+    """Say what went wrong, in one sentence, and exit with ``code``."""
+    print(f"error: {message}", file=sys.stderr)
+    if as_json:
+        print(json.dumps({"error": message}))
+    sys.stdout.flush()
+    raise typer.Exit(code)
+
+
+@contextmanager
+def _quiet_stdout(quiet: bool) -> Iterator[None]:
+    """Send what libraries print on stdout to stderr, so that stdout holds the one JSON object alone."""
+    if not quiet:
+        yield
+        return
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):  # what Python prints; the descriptor is for compiled code
+            yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[..., None]]:
+    """A ``masiv.progress.Progress`` on stderr: bars with the time left on a terminal, else a line now and then."""
+    if sys.stderr.isatty():
+        yield from _bars()
+    else:
+        yield _plain_lines()
+
+
+def _bars() -> Iterator[Callable[..., None]]:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("[bold]{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, Any] = {}
+
+        def report(stage: str, done: int, total: int, note: str = "") -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total, note=note)
+            bars.update(tasks[stage], completed=done, total=total, note=note)
+
+        yield report
+
+
+def _plain_lines() -> Callable[..., None]:
+    began: dict[str, tuple[float, int]] = {}
+    said: dict[str, float] = {}
+
+    def report(stage: str, done: int, total: int, note: str = "") -> None:
+        now = time.monotonic()
+        start, first = began.setdefault(stage, (now, done))
+        if now - said.get(stage, now - PLAIN_EVERY_S) < PLAIN_EVERY_S and done < total:
+            return
+        said[stage] = now
+        left = (now - start) * (total - done) / (done - first) if done > first else None
+        eta = "" if left is None or done >= total else f", {left:.0f} s left"
+        print(f"{stage} {done}/{total}{eta} {note}".rstrip(), file=sys.stderr, flush=True)
+
+    return report

@@ -1,0 +1,45 @@
+"""``masiv evaluate``: against ground truth, observed and future frames apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from masiv.cli.options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption
+
+
+def evaluate(
+    run: RunArgument,
+    truth: Annotated[
+        Path, typer.Option("--truth", help="Folder with particles_F.npy, (P, 3) metres a frame.", show_default=False)
+    ],
+    config: ConfigOption = None,
+    preset: PresetOption = None,
+    arch: ArchOption = None,
+    seed: SeedOption = None,
+    as_json: JsonOption = False,
+) -> tuple[dict[str, Any], str]:
+    """Chamfer, tracked error, PSNR and SSIM beside rigid baselines; evaluate.json in the run folder.
+
+    Example: `masiv evaluate runs/bunny --truth scenes/bunny/gt`
+    """
+    from masiv.cli import stages
+    from masiv.cli.console import progress_bar
+
+    folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
+    folder.require("trajectory")
+    stages.start(settings)
+    from masiv.report.numbers import evaluation_numbers, table
+    from masiv.runfolder import load_motion, write_json
+    from masiv.twin import Twin
+
+    dynamic, trajectory = stages.load_dynamic(folder), stages.load_trajectory(folder)
+    twin, rollout = None, None
+    if folder.done("identify") and folder.rollout.is_file():
+        twin, (rollout, _) = Twin.load(run), load_motion(folder.rollout)
+    with progress_bar() as progress:
+        numbers = evaluation_numbers(folder, scene, dynamic, trajectory, twin, rollout, truth, progress=progress)
+    write_json(folder.evaluation, numbers)
+    return {"evaluation": str(folder.evaluation), **numbers}, f"{table(numbers)}\n{folder.evaluation}"

@@ -1,0 +1,52 @@
+"""``masiv``: the list of commands. Each stands in its own file and imports what is heavy when it runs."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from masiv.cli import console
+from masiv.cli.evaluate import evaluate
+from masiv.cli.identify import identify
+from masiv.cli.inspect import inspect
+from masiv.cli.pretrain import pretrain
+from masiv.cli.reconstruct import reconstruct
+from masiv.cli.simulate import simulate
+from masiv.cli.synth import synth
+from masiv.cli.trajectory import trajectory
+
+app = typer.Typer(
+    name="masiv",
+    help="From multi-view video of a deforming object to a digital twin: geometry, motion, constitutive law.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+for function in (identify, inspect, reconstruct, trajectory, simulate, evaluate, pretrain, synth):
+    app.command()(console.command(function))
+
+
+def run() -> None:
+    """The entry point. A wrong option is bad input: one sentence, exit code 2."""
+    try:
+        code = app(standalone_mode=False)
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        if type(error).__name__ == "NoArgsIsHelpError":
+            error.show()  # type: ignore[attr-defined]
+            sys.exit(console.BAD_INPUT)
+        message = error.format_message()  # type: ignore[attr-defined]
+        print(f"error: {message} (see masiv --help)", file=sys.stderr)
+        if "--json" in sys.argv:
+            import json
+
+            print(json.dumps({"error": message}))
+        code = console.BAD_INPUT
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+if __name__ == "__main__":
+    run()

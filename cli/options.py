@@ -1,0 +1,41 @@
+"""The options that every command shares, as typer annotations. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a scene.", show_default=False)]
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.", show_default=False)]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="YAML with settings; over the preset, under flags.")
+]
+PresetOption = Annotated[str | None, typer.Option("--preset", help="quick, standard or paper. [default: standard]")]
+ArchOption = Annotated[str | None, typer.Option("--arch", help="cpu, cuda or vulkan. [default: cpu]")]
+SeedOption = Annotated[int | None, typer.Option("--seed", help="Seed of every random number. [default: 0]")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else there.")]
+FitFramesOption = Annotated[
+    int | None, typer.Option("--fit-frames", help="Fit on the first N frames; the rest stays unseen.")
+]
+HoldoutOption = Annotated[
+    list[int] | None, typer.Option("--holdout-camera", help="Keep camera K out of training; may be repeated.")
+]
+
+
+def vector(text: str | None, flag: str) -> tuple[float, float, float] | None:
+    """'1,2.5,-3' as three finite numbers. Raises InputError."""
+    import math
+
+    from masiv.errors import InputError
+
+    if text is None:
+        return None
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not all(map(math.isfinite, values)):
+        raise InputError(f"{flag} {text}: give three finite numbers with commas, for example {flag}=0,-1.5,0")
+    return values[0], values[1], values[2]

@@ -1,0 +1,143 @@
+"""The stages in order, each run where the run folder lacks it. What several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from masiv import runtime
+from masiv.config import Config, load_config
+from masiv.progress import Progress
+from masiv.report.history import logged
+from masiv.runfolder import Request, RunFolder
+from masiv.scene.read import read_scene
+from masiv.scene.scene import Scene
+from masiv.scene.summary import identity
+
+if TYPE_CHECKING:
+    from masiv.continuum.trajectory import Trajectory
+    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.twin import Twin
+
+
+def open_run(
+    scene_path: Path,
+    out: Path,
+    *,
+    preset: str | None = None,
+    config: Path | None = None,
+    seed: int | None = None,
+    arch: str | None = None,
+    fit_frames: int | None = None,
+    holdout: list[int] | None = None,
+) -> tuple[RunFolder, Config, Scene]:
+    """The run in ``out``, new or resumed, its configuration and the whole scene. What is not given is as in the run.
+
+    Everything is checked before the folder is made. Raises InputError.
+    """
+    existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
+    settings = load_config(preset, config, existing.config if existing else None, seed=seed, arch=arch)
+    scene = read_scene(scene_path)
+    if fit_frames is None:
+        fit_frames = existing.fit_frames if existing else scene.fit_frames or scene.frame_count
+    cameras = tuple(sorted(set(holdout))) if holdout else existing.holdout_cameras if existing else ()
+    scene.restricted(fit_frames, cameras)
+    request = Request(settings.model_dump(mode="json"), scene_path, identity(scene), fit_frames, cameras)
+    return RunFolder.create_or_resume(out, request), settings, scene
+
+
+def reopen_run(
+    run_path: Path, *, preset: str | None, config: Path | None, seed: int | None, arch: str | None
+) -> tuple[RunFolder, Config, Scene]:
+    """An existing run, with the scene that it was made of."""
+    existing = RunFolder.open(run_path)
+    return open_run(existing.scene_path, run_path, preset=preset, config=config, seed=seed, arch=arch)
+
+
+def fitted_scene(run: RunFolder, scene: Scene) -> Scene:
+    """What a stage that fits may see."""
+    return scene.restricted(run.fit_frames, run.holdout_cameras)
+
+
+def reconstructed(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> DynamicGaussians:
+    """The run's dynamic Gaussians, made now where it lacks them."""
+    runtime.start(config.arch)
+    if run.done("reconstruct"):
+        return load_dynamic(run)
+    from masiv.splat.reconstruct import reconstruct
+
+    with run.stage("reconstruct") as checkpoint:
+        dynamic = reconstruct(
+            fitted_scene(run, scene),
+            config.reconstruct,
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=logged(progress, run.log),
+        )
+        dynamic.save(run.path)
+    return dynamic
+
+
+def estimated(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Trajectory:
+    """The run's trajectory, made now where it lacks it."""
+    runtime.start(config.arch)
+    if run.done("trajectory"):
+        return load_trajectory(run)
+    from masiv.continuum.trajectory import estimate_trajectory
+
+    dynamic = reconstructed(run, config, scene, progress)
+    with run.stage("trajectory") as checkpoint:
+        trajectory = estimate_trajectory(
+            fitted_scene(run, scene),
+            dynamic,
+            config.trajectory,
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=logged(progress, run.log),
+        )
+        trajectory.save(run.trajectory)
+    return trajectory
+
+
+def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Twin:
+    """The run's twin, made now where it lacks it."""
+    runtime.start(config.arch)
+    from masiv.identify import identify
+    from masiv.twin import Twin
+
+    if run.done("identify"):
+        return Twin.load(run.path)
+    trajectory = estimated(run, config, scene, progress)
+    with run.stage("identify") as checkpoint:
+        twin = identify(
+            fitted_scene(run, scene),
+            trajectory,
+            config.identify,
+            config.simulator,
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=logged(progress, run.log),
+        )
+        twin.save(run.path)
+    return twin
+
+
+def start(config: Config) -> None:
+    """Start Taichi where the configuration says."""
+    runtime.start(config.arch)
+
+
+def load_dynamic(run: RunFolder) -> DynamicGaussians:
+    """The Gaussians of a finished reconstruct stage. Raises InputError."""
+    from masiv.splat.dynamic import DynamicGaussians
+
+    run.require("reconstruct")
+    return DynamicGaussians.load(run.path)
+
+
+def load_trajectory(run: RunFolder) -> Trajectory:
+    """The result of a finished trajectory stage. Raises InputError."""
+    from masiv.continuum.trajectory import Trajectory
+
+    run.require("trajectory")
+    return Trajectory.load(run.trajectory)

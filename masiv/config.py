@@ -1,0 +1,76 @@
+"""The whole configuration. Order: defaults < preset < --config < flags. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from masiv.continuum.config import TrajectoryConfig
+from masiv.errors import InputError
+from masiv.identify.config import IdentifyConfig
+from masiv.mpm.config import SimulatorConfig
+from masiv.splat.config import ReconstructConfig
+from masiv.strict import read_yaml, validated
+
+Preset = Literal["quick", "standard", "paper"]
+DEFAULT_PRESET = "standard"
+
+
+class Config(BaseModel):
+    """What a run is asked to do. ``arch`` is where kernels run; every other key may change the numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    preset: Preset = DEFAULT_PRESET
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    arch: Literal["cpu", "cuda", "vulkan"] = "cpu"
+    reconstruct: ReconstructConfig = ReconstructConfig()
+    trajectory: TrajectoryConfig = TrajectoryConfig()
+    simulator: SimulatorConfig = SimulatorConfig()
+    identify: IdentifyConfig = IdentifyConfig()
+
+
+def load_config(
+    preset: str | None = None,
+    path: Path | None = None,
+    base: Mapping[str, Any] | None = None,
+    **flags: int | str | None,
+) -> Config:
+    """The configuration from a preset, a YAML file and flags (None: not given).
+
+    ``base`` is the configuration of an existing run. It takes the place of the defaults; under a preset that
+    is given, only its seed and arch do.
+    Raises InputError for an unknown preset or key, naming the nearest known one, and for a value out of range.
+    """
+    from_file = {} if path is None else read_yaml(path)
+    name = preset or from_file.get("preset")
+    merged: dict[str, Any] = dict(base or {})
+    if name is not None or base is None:
+        kept = {key: merged[key] for key in ("seed", "arch") if key in merged}
+        merged = {**kept, **preset_overlay(str(name or DEFAULT_PRESET))}
+    merged = _merged(merged, from_file)
+    if preset is not None:
+        merged["preset"] = preset
+    merged |= {key: value for key, value in flags.items() if value is not None}
+    return validated(Config, merged, "the command line" if path is None else str(path))
+
+
+def preset_overlay(name: str) -> dict[str, Any]:
+    """The keys that preset ``name`` sets. Raises InputError for an unknown name."""
+    if name not in get_args(Preset):
+        raise InputError(f"unknown preset '{name}': use one of {', '.join(get_args(Preset))}")
+    text = files("masiv.presets").joinpath(f"{name}.yaml").read_text(encoding="utf-8")
+    return {"preset": name, **(yaml.safe_load(text) or {})}
+
+
+def _merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
+    """``high`` over ``low``, mapping by mapping."""
+    result = dict(low)
+    for key, value in high.items():
+        below = result.get(key)
+        result[key] = _merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+    return result

@@ -1,0 +1,47 @@
+"""One picture of a scene: a row a view, a column a frame, the mask's outline drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from masiv.report.media import write_png
+from masiv.scene.scene import Scene
+
+OUTLINE = (255, 60, 0)
+HIDDEN = (90, 90, 200)
+
+
+def contact_sheet(scene: Scene, columns: int = 6, tile: int = 160) -> np.ndarray:
+    """(H, W, 3) uint8 RGB; ``columns`` frames spread over the scene, each picture ``tile`` pixels wide."""
+    frames = np.unique(np.linspace(0, scene.frame_count - 1, min(columns, scene.frame_count)).round().astype(int))
+    rows = [np.concatenate([_tile(scene, view, int(frame), tile) for frame in frames], axis=1) for view in scene.views]
+    return np.concatenate(rows, axis=0)
+
+
+def write_contact_sheet(scene: Scene, path: Path) -> None:
+    """Write ``contact_sheet(scene)`` as a PNG."""
+    write_png(path, contact_sheet(scene))
+
+
+def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """A copy of ``image`` (H, W, 3) with the outline of ``mask`` (H, W) drawn one pixel wide."""
+    drawn = np.ascontiguousarray(image.copy())
+    contours, _ = cv2.findContours((mask > 0.5).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(drawn, contours, -1, OUTLINE, 1)
+    return drawn
+
+
+def _tile(scene: Scene, view: int, frame: int, width: int) -> np.ndarray:
+    picture = scene.frame(view, frame)
+    height = max(1, round(width * picture.image.shape[0] / picture.image.shape[1]))
+    inter = cv2.INTER_AREA if picture.image.shape[1] > width else cv2.INTER_NEAREST
+    image = cv2.resize(picture.image, (width, height), interpolation=inter)
+    hidden = cv2.resize((~picture.valid).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    image[hidden] = (image[hidden] // 2 + np.array(HIDDEN, np.uint8) // 2).astype(np.uint8)
+    tile = outlined(image, cv2.resize(picture.mask, (width, height), interpolation=cv2.INTER_LINEAR))
+    cv2.putText(tile, f"{view}:{frame}", (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 2, cv2.LINE_AA)
+    cv2.putText(tile, f"{view}:{frame}", (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (255, 255, 255), 1, cv2.LINE_AA)
+    return tile

@@ -1,0 +1,141 @@
+"""The numbers of a run and of its evaluation, each with its unit, frames and views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from masiv import metrics
+from masiv.errors import InputError
+from masiv.report.draw import draw, on_black
+from masiv.scene.scene import Ground, Scene
+from masiv.splat.gaussians import Gaussians
+
+UNITS = {
+    "psnr_db": "dB, whole picture, object on black",
+    "psnr_box_db": "dB, box of the observed mask, object on black",
+    "ssim": "1, whole picture",
+    "ssim_box": "1, box of the observed mask",
+    "mask_iou": "1",
+    "trajectory_rmse_mm": "mm, root mean square over particles and frames",
+    "chamfer_1e3mm2": "10³ mm², squared, mean, both directions summed",
+    "chamfer_floor_1e3mm2": "10³ mm², two disjoint halves of the truth",
+    "tracked_error_mm": "mm, mean distance to the true displacement",
+    "seconds": "s",
+}
+
+
+def picture_numbers(
+    scene: Scene, gaussians_at: Callable[[int], Gaussians], views: Sequence[int], frames: Sequence[int]
+) -> dict[str, Any] | None:
+    """Mean PSNR, SSIM and mask IoU of drawn Gaussians against the observed object, or None without view or frame.
+
+    Pixels that an occluder hides are black on both sides; pictures that are missing are left out.
+    """
+    scores: list[dict[str, float]] = []
+    by_frame: dict[int, list[float]] = {frame: [] for frame in frames}
+    for frame in frames:
+        gaussians = gaussians_at(frame)
+        for view in views:
+            observed = scene.frame(view, frame)
+            if not observed.valid.any():
+                continue
+            image, alpha = draw(gaussians, scene.cameras[view])
+            reference = on_black(observed.image, observed.mask * observed.valid)
+            image[~observed.valid] = 0
+            score = metrics.picture_scores(image, reference, observed.mask)
+            score["mask_iou"] = metrics.mask_iou(alpha * observed.valid, observed.mask * observed.valid)
+            scores.append(score)
+            by_frame[frame].append(score.get("psnr_box_db", np.nan))
+    if not scores:
+        return None
+    names = sorted({name for score in scores for name in score})
+    means = {name: float(np.mean([score[name] for score in scores if name in score])) for name in names}
+    curve = {"psnr_box_db_by_frame": [float(np.mean(by_frame[frame])) if by_frame[frame] else None for frame in frames]}
+    return {"views": list(views), "frames": list(frames), **means, **curve}
+
+
+def agreement(rollout: np.ndarray, trajectory: np.ndarray) -> dict[str, Any]:
+    """RMSE [mm] between the twin's particles and the estimated ones, (T, Q, 3) both, over frames 1…T−1."""
+    frames = min(len(rollout), len(trajectory))
+    if rollout.shape[1:] != trajectory.shape[1:]:
+        raise InputError(f"rollout {rollout.shape} and trajectory {trajectory.shape} are of different particles")
+    squared = ((rollout[:frames].astype(np.float64) - trajectory[:frames]) ** 2).sum(-1).mean(-1)
+    return {
+        "frames": list(range(1, frames)),
+        "trajectory_rmse_mm": float(1e3 * np.sqrt(squared[1:].mean())),
+        "trajectory_rmse_mm_by_frame": (1e3 * np.sqrt(squared)).tolist(),
+    }
+
+
+def read_truth(folder: Path, frames: int) -> np.ndarray:
+    """``folder``/particles_F.npy (P, 3) [m] for F = 0…, at most ``frames`` of them -> (T, P, 3). Raises InputError."""
+    positions: list[np.ndarray] = []
+    while len(positions) < frames and (path := folder / f"particles_{len(positions)}.npy").is_file():
+        try:
+            points = np.load(path, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path} is not an array of points ({error})") from error
+        if points.ndim != 2 or points.shape[1] != 3 or (positions and points.shape != positions[0].shape):
+            raise InputError(f"{path} has shape {points.shape}: every frame needs the same particles, (P, 3)")
+        positions.append(points)
+    if not positions:
+        raise InputError(
+            f"{folder} has no particles_0.npy: give the folder with particles_F.npy, one (P, 3) array a frame"
+        )
+    return np.stack(positions)
+
+
+def motion_numbers(
+    motion: np.ndarray, truth: np.ndarray, frames: Sequence[int], *, max_points: int = 8192, seed: int = 0
+) -> dict[str, Any] | None:
+    """Chamfer and tracked error of ``motion`` (T, Q, 3) over ``frames``; frame 0, where tracking is exact, is left out
+    of the latter. None where neither has such frames."""
+    frames = [frame for frame in frames if frame < min(len(motion), len(truth))]
+    if not frames:
+        return None
+    chamfer = [metrics.chamfer_1e3mm2(motion[f], truth[f], max_points, seed) for f in frames]
+    known = min(len(motion), len(truth))
+    tracked = metrics.tracked_error_mm(motion[0], motion[:known], truth[:known])
+    moving = [frame for frame in frames if frame > 0]
+    return {
+        "frames": frames,
+        "chamfer_1e3mm2": float(np.mean(chamfer)),
+        "tracked_error_mm": float(tracked[moving].mean()) if moving else None,
+        "chamfer_1e3mm2_by_frame": chamfer,
+        "tracked_error_mm_by_frame": tracked[frames].tolist(),
+    }
+
+
+def baselines(
+    rest: np.ndarray,
+    velocity: np.ndarray,
+    omega: np.ndarray,
+    gravity: np.ndarray,
+    times: np.ndarray,
+    ground: Ground | None,
+) -> dict[str, np.ndarray]:
+    """Motions (T, Q, 3) [m] that know no material: rigid free flight, and the same stopping at the ground."""
+    centre = rest.mean(axis=0)
+    flights = {"rigid free flight": metrics.rigid_ballistic(rest, velocity, omega, centre, gravity, times)}
+    if ground is not None:
+        stopped = metrics.rigid_ballistic(rest, velocity, omega, centre, gravity, times, ground)
+        flights["rigid, stops at the ground"] = stopped
+    return flights
+
+
+def initial_motion(positions: np.ndarray, times: np.ndarray, gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity (3,) [m/s] of the centroid and spin (3,) [rad/s] of a rigid body that best explain the first step.
+
+    The mean acceleration of the step is taken to be ``gravity``. Spin from the Kabsch rotation between frames 0 and 1.
+    """
+    from scipy.spatial.transform import Rotation
+
+    step = float(times[1] - times[0])
+    before, after = positions[0].astype(np.float64), positions[1].astype(np.float64)
+    velocity = (after.mean(0) - before.mean(0)) / step - 0.5 * gravity * step
+    rotation, _ = Rotation.align_vectors(after - after.mean(0), before - before.mean(0))
+    return velocity, rotation.as_rotvec() / step

@@ -1,0 +1,174 @@
+"""What metrics.json and evaluate.json hold. Blocks carry the frames and views that they were taken on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from masiv import metrics
+from masiv.progress import Progress, silent
+from masiv.report import measure
+from masiv.report.follow import Binding
+from masiv.runfolder import RunFolder
+from masiv.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from masiv.continuum.trajectory import Trajectory
+    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.twin import Twin
+
+
+def _views(run: RunFolder, scene: Scene) -> tuple[list[int], list[int]]:
+    held_out = list(run.holdout_cameras)
+    return [view for view in range(len(scene.cameras)) if view not in held_out], held_out
+
+
+def reconstruction_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussians) -> dict[str, Any]:
+    """Pictures of the Gaussians on the fitted frames, seen and held-out cameras apart."""
+    frames = list(range(run.fit_frames))
+    training, held_out = _views(run, scene)
+    return {
+        name: measure.picture_numbers(scene, lambda f: dynamic.at(f / scene.fps), views, frames)
+        for name, views in (("training_views", training), ("held_out_views", held_out))
+    }
+
+
+def twin_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout: np.ndarray) -> dict[str, Any]:
+    """Pictures of the Gaussians carried by the twin's particles, over fitted and future frames, on every camera."""
+    binding = Binding.at_rest(dynamic.at(0.0), rollout[0])
+    views = list(range(len(scene.cameras)))
+    return {
+        name: measure.picture_numbers(scene, lambda f: binding.moved(rollout[f]), views, frames)
+        for name, frames in _split(run, scene)
+    }
+
+
+def _split(run: RunFolder, scene: Scene) -> tuple[tuple[str, list[int]], ...]:
+    return (
+        ("observed", list(range(run.fit_frames))),
+        ("future", list(range(run.fit_frames, scene.frame_count))),
+    )
+
+
+def run_numbers(
+    run: RunFolder, scene: Scene, dynamic: DynamicGaussians, trajectory: Trajectory, rollout: np.ndarray
+) -> dict[str, Any]:
+    """metrics.json of ``masiv identify``: no ground truth is needed."""
+    return {
+        "schema": 1,
+        "units": measure.UNITS,
+        "reconstruction": reconstruction_numbers(run, scene, dynamic),
+        "twin": twin_numbers(run, scene, dynamic, rollout),
+        "fit": measure.agreement(rollout, trajectory.positions),
+        "trajectory": {
+            "particles": int(rollout.shape[1]),
+            "spacing_m": float(trajectory.spacing),
+            "volume_m3": float(trajectory.volume),
+        },
+        "seconds": run.seconds(),
+    }
+
+
+def evaluation_numbers(
+    run: RunFolder,
+    scene: Scene,
+    dynamic: DynamicGaussians,
+    trajectory: Trajectory,
+    twin: Twin | None,
+    rollout: np.ndarray | None,
+    truth_folder: Path,
+    *,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """evaluate.json: against the true particles. ``twin`` and ``rollout`` are None where identify has not run.
+
+    The baselines start as the twin does, or, without one, as the first step of the trajectory does.
+    """
+    truth = measure.read_truth(truth_folder, scene.frame_count)
+    seed = int(run.config["seed"])
+    motions = {"trajectory": trajectory.positions}
+    rest = trajectory.positions[0].astype(np.float64)
+    velocity, omega = measure.initial_motion(trajectory.positions, trajectory.times, scene.gravity)
+    if rollout is not None and twin is not None:
+        motions["twin"] = rollout
+        rest, velocity, omega = rollout[0].astype(np.float64), np.array(twin.velocity), np.array(twin.omega)
+    motions |= measure.baselines(rest, velocity, omega, scene.gravity, scene.times, scene.ground)
+    motion: dict[str, dict[str, Any]] = {}
+    for done, (name, positions) in enumerate(motions.items()):
+        progress("evaluate", done, len(motions))
+        motion[name] = {
+            split: measure.motion_numbers(positions, truth, frames, seed=seed) for split, frames in _split(run, scene)
+        }
+    progress("evaluate", len(motions), len(motions))
+    floor = [metrics.chamfer_floor(points, seed=seed) for points in truth]
+    return {
+        "schema": 1,
+        "units": measure.UNITS,
+        "truth": {"folder": str(truth_folder), "frames": len(truth), "particles": int(truth.shape[1])},
+        "chamfer_floor_1e3mm2": float(np.mean(floor)),
+        "baseline_start": {"velocity_m_s": velocity.tolist(), "omega_rad_s": omega.tolist()},
+        "motion": motion,
+        "reconstruction": reconstruction_numbers(run, scene, dynamic),
+        "twin": None if rollout is None else twin_numbers(run, scene, dynamic, rollout),
+    }
+
+
+COLUMNS = {
+    "psnr_box_db": "PSNR box [dB]",
+    "psnr_db": "PSNR [dB]",
+    "ssim": "SSIM",
+    "mask_iou": "mask IoU",
+    "chamfer_1e3mm2": "Chamfer [10³ mm²]",
+    "tracked_error_mm": "tracked [mm]",
+    "trajectory_rmse_mm": "to trajectory [mm]",
+}
+
+
+def blocks(numbers: Mapping[str, Any], name: str = "") -> list[tuple[str, Mapping[str, Any]]]:
+    """The nested blocks that hold measured numbers, with their names in words."""
+    if any(column in numbers for column in COLUMNS):
+        return [(name, numbers)]
+    found = []
+    for key, value in numbers.items():
+        if isinstance(value, Mapping):
+            found += blocks(value, f"{name}, {key.replace('_', ' ')}" if name else key.replace("_", " "))
+    return found
+
+
+def rows(numbers: Mapping[str, Any]) -> tuple[list[str], list[list[Any]]]:
+    """Header and rows of a table of ``numbers``: one row a block, one column a metric that any block has."""
+    found = [(name, block) for name, block in blocks(numbers)]
+    used = [key for key in COLUMNS if any(key in block for _, block in found)]
+    body = [
+        [name, _span(block.get("frames")), _span(block.get("views")), *(block.get(key) for key in used)]
+        for name, block in found
+    ]
+    return ["what", "frames", "views", *(COLUMNS[key] for key in used)], body
+
+
+def table(numbers: Mapping[str, Any]) -> str:
+    """``rows`` as plain text."""
+    from masiv.report.page import number
+
+    header, body = rows(numbers)
+    cells = [header, *([number(value) for value in row] for row in body)]
+    widths = [max(len(row[column]) for row in cells) for column in range(len(header))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+    floor = numbers.get("chamfer_floor_1e3mm2")
+    return "\n".join(lines + ([] if floor is None else [f"floor of Chamfer by sampling: {floor:.3g} 10³ mm²"]))
+
+
+def _span(indices: list[int] | None) -> str | None:
+    """[0, 1, 2, 5] -> '0–2, 5'."""
+    if not indices:
+        return None
+    runs: list[list[int]] = []
+    for index in indices:
+        if runs and index == runs[-1][-1] + 1:
+            runs[-1].append(index)
+        else:
+            runs.append([index])
+    return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)

@@ -1,0 +1,149 @@
+"""``report.html``: what was seen, what was made of it, and how well it agrees."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from masiv.report import plots
+from masiv.report.draw import draw, on_black
+from masiv.report.film import joined
+from masiv.report.follow import Binding
+from masiv.report.history import curves
+from masiv.report.media import write_video
+from masiv.report.numbers import rows
+from masiv.report.page import Page
+from masiv.runfolder import RunFolder
+from masiv.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from masiv.continuum.trajectory import Trajectory
+    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.twin import Twin
+
+VIDEO_VIEWS = 2
+SLOWER = 4  # a fall lasts half a second: shown at real speed, nothing is seen
+GREY = 90
+
+
+def write_report(
+    run: RunFolder,
+    scene: Scene,
+    dynamic: DynamicGaussians,
+    trajectory: Trajectory,
+    twin: Twin,
+    rollout: np.ndarray,
+    numbers: Mapping[str, Any],
+) -> None:
+    """Write the run's report.html. ``numbers`` is what metrics.json holds, rollout (T, Q, 3) [m] covers every frame."""
+    page = Page(f"Digital twin of {scene.path.resolve().name}")
+    page.note(
+        f"{len(scene.cameras)} cameras, {scene.frame_count} frames at {scene.fps:g} fps; fitted on frames 0 to "
+        f"{run.fit_frames - 1}; cameras kept out of the fit: {', '.join(map(str, run.holdout_cameras)) or 'none'}."
+    )
+    page.heading("Observed, reconstructed, simulated")
+    for view in shown_views(run, scene):
+        role = "not seen by the fit" if view in run.holdout_cameras else "seen by the fit"
+        page.video(
+            comparison_video(run, scene, dynamic, rollout, view),
+            f"Camera {view}, {role}, {SLOWER}× slower. Left: observed. Middle: reconstruction, fitted frames only. "
+            "Right: twin, simulated from frame 0.",
+        )
+    page.heading("Numbers")
+    page.table(*rows(numbers))
+    page.note("PSNR and SSIM: object on black. 'to trajectory' is what the fit made small, no ground truth.")
+    page.heading("The twin")
+    page.table(["quantity", "value", "unit"], _twin_rows(twin))
+    page.picture(plots.law_curves(twin.law), "stress of the identified law")
+    page.heading("Motion")
+    fit_end = (run.fit_frames - 1) / scene.fps
+    motions = {"trajectory": (trajectory.positions, trajectory.times), "twin": (rollout, scene.times)}
+    page.picture(plots.centroid_path(motions, scene.up, fit_end), "path of the centroid")
+    fit = numbers["fit"]["trajectory_rmse_mm_by_frame"]
+    page.picture(
+        plots.over_frames({"twin": (range(len(fit)), fit)}, "twin to trajectory", "RMSE [mm]", run.fit_frames),
+        "distance between twin and trajectory",
+    )
+    page.picture(_picture_curves(run, numbers), "PSNR over frames")
+    losses = curves(run.log)
+    if losses:
+        page.heading("Convergence")
+        page.picture(plots.loss_curves(losses), "what each stage reported")
+    page.heading("How it was made")
+    page.table(["stage", "seconds"], [[name, float(value)] for name, value in run.seconds().items()])
+    versions = ", ".join(f"{name} {version}" for name, version in run.record["versions"].items())
+    page.note(f"Preset {run.config['preset']}, seed {run.config['seed']}, {versions}. All settings: run.yaml.")
+    page.write(run.report)
+
+
+def shown_views(run: RunFolder, scene: Scene) -> list[int]:
+    """A held-out camera first, where there is one, then training cameras."""
+    training = [view for view in range(len(scene.cameras)) if view not in run.holdout_cameras]
+    return [*run.holdout_cameras, *training][:VIDEO_VIEWS]
+
+
+def comparison_frames(
+    run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout: np.ndarray, view: int, height: int = 360
+) -> list[np.ndarray]:
+    """Observed | reconstruction | twin, one picture a frame, ``height`` pixels high. Grey where there is none."""
+    camera = scene.cameras[view]
+    binding = Binding.at_rest(dynamic.at(0.0), rollout[0])
+    pictures = []
+    for frame in range(scene.frame_count):
+        observed = scene.frame(view, frame)
+        seen = on_black(observed.image, observed.mask)
+        made = np.full_like(seen, GREY)
+        if frame < run.fit_frames:
+            made, _ = draw(dynamic.at(frame / scene.fps), camera)
+        simulated, _ = draw(binding.moved(rollout[frame]), camera)
+        gap = np.full((seen.shape[0], 2, 3), 255, np.uint8)
+        row = joined([seen, gap, made, gap, simulated])
+        width = round(row.shape[1] * height / row.shape[0])
+        enlarge = cv2.INTER_LANCZOS4 if height > row.shape[0] else cv2.INTER_AREA
+        pictures.append(cv2.resize(row, (width, height), interpolation=enlarge))
+    return pictures
+
+
+def comparison_video(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout: np.ndarray, view: int) -> bytes:
+    """``comparison_frames`` as mp4."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "comparison.mp4"
+        write_video(path, comparison_frames(run, scene, dynamic, rollout, view), scene.fps, repeat=SLOWER)
+        return path.read_bytes()
+
+
+def _twin_rows(twin: Twin) -> list[list[Any]]:
+    rows: list[list[Any]] = [
+        ["initial velocity", twin.velocity.tolist(), "m/s"],
+        ["initial spin", twin.omega.tolist(), "rad/s"],
+        ["gravity", twin.gravity.tolist(), "m/s²"],
+        ["volume", float(twin.volume), "m³"],
+        ["density (given, not identified)", float(twin.density), "kg/m³"],
+        ["ground height", None if twin.ground is None else float(twin.ground.height), "m"],
+        ["contact", twin.contact, ""],
+    ]
+    for name, value in [*twin.law.description().items(), *twin.fit.items()]:
+        if isinstance(value, Mapping) and "value" in value:
+            rows.append([name.replace("_", " "), value["value"], value.get("unit", "")])
+        elif isinstance(value, (str, int, float)):
+            rows.append([name.replace("_", " "), value, ""])
+    return rows
+
+
+def _picture_curves(run: RunFolder, numbers: Mapping[str, Any]) -> bytes:
+    found: dict[str, tuple[list[int], list[float | None]]] = {}
+    for name, block in (
+        ("reconstruction, training cameras", numbers["reconstruction"]["training_views"]),
+        ("reconstruction, held-out cameras", numbers["reconstruction"]["held_out_views"]),
+    ):
+        if block:
+            found[name] = block["frames"], block["psnr_box_db_by_frame"]
+    twin = [block for block in numbers["twin"].values() if block]
+    frames = [frame for block in twin for frame in block["frames"]]
+    found["twin, all cameras"] = frames, [value for block in twin for value in block["psnr_box_db_by_frame"]]
+    return plots.over_frames(found, "agreement of pictures", "PSNR in the mask's box [dB]", run.fit_frames)

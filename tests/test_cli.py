@@ -1,0 +1,143 @@
+"""The commands as a user runs them: exit codes, one JSON object, one sentence."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from masiv.cli import main
+
+COMMANDS = ["identify", "inspect", "reconstruct", "trajectory", "simulate", "evaluate", "pretrain", "synth"]
+
+
+class Result:
+    def __init__(self, returncode, stdout, stderr):
+        self.returncode, self.stdout, self.stderr = returncode, stdout, stderr
+
+
+@pytest.fixture
+def masiv(monkeypatch, capfd):
+    """Run a command in this process: a fresh one each would mostly measure imports."""
+
+    def run(*arguments, cwd=None):
+        monkeypatch.setattr(sys, "argv", ["masiv", *map(str, arguments)])
+        if cwd is not None:
+            monkeypatch.chdir(cwd)
+        with pytest.raises(SystemExit) as ended:
+            main.run()
+        return Result(ended.value.code, *capfd.readouterr())
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A red square that falls, seen by two cameras that face each other."""
+    folder = tmp_path_factory.mktemp("scene")
+    (folder / "data").mkdir()
+    rows = []
+    for view, sign in ((0, 1.0), (1, -1.0)):
+        pose = np.diag([sign, 1.0, sign]), np.array([0, 0.5, sign * 2])
+        for frame in range(3):
+            image = np.full((32, 32, 3), 90, np.uint8)
+            cutout = np.full((32, 32, 3), 255, np.uint8)
+            for target in (image, cutout):
+                target[8 + frame : 18 + frame, 10:20] = (20, 20, 220)
+            cv2.imwrite(str(folder / f"data/r_{view}_{frame}.png"), image)
+            cv2.imwrite(str(folder / f"data/m_{view}_{frame}.png"), cutout)
+            rows.append(
+                {
+                    "file_path": f"./data/r_{view}_{frame}.png",
+                    "c2w": np.column_stack(pose).tolist(),
+                    "intrinsic": [[40, 0, 16], [0, 40, 16], [0, 0, 1]],
+                    "time": frame / 24,
+                }
+            )
+    (folder / "all_data.json").write_text(json.dumps(rows))
+    return folder
+
+
+def test_help_is_quick():
+    """In a process of its own: 0.3 s on an idle machine, seconds if it imported torch."""
+    began = time.perf_counter()
+    result = subprocess.run(
+        [sys.executable, "-m", "masiv.cli.main", "--help"], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0
+    assert all(name in result.stdout for name in COMMANDS)
+    assert time.perf_counter() - began < 5
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_an_example_and_the_shared_options(masiv, command):
+    text = masiv(command, "--help").stdout
+    assert f"masiv {command}" in text
+    for option in ("--config", "--preset", "--arch", "--seed", "--json"):
+        assert option in text
+
+
+def test_inspect_prints_one_json_object_and_draws(masiv, scene, tmp_path):
+    result = masiv("inspect", scene, "--json", "--out", tmp_path / "sheet.png")
+    assert result.returncode == 0, result.stderr
+    data = json.loads(result.stdout)
+    assert (data["frames"], data["views"], data["fps"], data["problems"]) == (3, 2, 24, [])
+    assert data["mask_coverage"]["mean"] == pytest.approx(100 / 1024)
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet.shape == (2 * 160, 3 * 160, 3)
+    assert (sheet == (0, 60, 255)).all(-1).any()  # the outline, in BGR
+
+
+def test_inspect_for_a_person(masiv, scene, tmp_path):
+    result = masiv("inspect", scene, cwd=tmp_path)
+    assert "3 at 24 fps" in result.stdout
+    assert "gravity (0, -9.8, 0) m/s²" in result.stdout
+    assert list(tmp_path.glob("*_inspect.png"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["inspect", "/nowhere"], "/nowhere is not a folder"),
+        (["inspect", "SCENE", "--preset", "fast"], "unknown preset 'fast'"),
+        (["inspect", "SCENE", "--frobnicate"], "--frobnicate"),
+        (["inspect"], "SCENE"),
+        (["reconstruct", "SCENE", "--out", "OUT", "--fit-frames", "9"], "give 2 to 3"),
+        (["reconstruct", "SCENE", "--out", "OUT", "--holdout-camera", "2"], "cameras 0 to 1"),
+        (["reconstruct", "SCENE", "--out", "OUT", "--config", "/none.yaml"], "/none.yaml"),
+        (["identify", "SCENE", "--out", "SCENE"], "not a run folder"),
+        (["trajectory", "SCENE"], "not a run folder"),
+        (["evaluate", "SCENE", "--truth", "SCENE"], "not a run folder"),
+        (["simulate", "SCENE", "--frames", "3", "--velocity", "1,2"], "three finite numbers"),
+        (["pretrain", "cheese"], "cheese"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(masiv, scene, tmp_path, arguments, message):
+    filled = [{"SCENE": str(scene), "OUT": str(tmp_path / "run")}.get(a, a) for a in arguments]
+    result = masiv(*filled, "--json", cwd=tmp_path)
+    assert result.returncode == 2, result.stderr
+    assert message in json.loads(result.stdout)["error"]
+    sentences = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert len(sentences) == 1
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_work_that_fails_is_exit_code_1(masiv, scene, tmp_path):
+    """The two cameras' masks are moved apart, so that no volume projects on both."""
+    broken = tmp_path / "scene"
+    broken.mkdir()
+    (broken / "data").mkdir()
+    for path in scene.glob("data/*.png"):
+        image = cv2.imread(str(path))
+        image = np.roll(image, 18 if "_1_" in path.name else -6, axis=0)
+        cv2.imwrite(str(broken / "data" / path.name), image)
+    (broken / "all_data.json").write_text((scene / "all_data.json").read_text())
+    result = masiv("reconstruct", broken, "--out", tmp_path / "run", "--json")
+    assert result.returncode == 1, result.stderr
+    assert "frame 0" in json.loads(result.stdout)["error"]

@@ -1,0 +1,170 @@
+"""Gaussians that follow particles, backgrounds, the log and the page."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from masiv.errors import InputError
+from masiv.report import history, measure, plots
+from masiv.report.draw import backdrop, draw
+from masiv.report.follow import Binding
+from masiv.report.media import write_png, write_video
+from masiv.report.numbers import rows, table
+from masiv.report.page import Page, number
+from masiv.scene.camera import Camera
+from masiv.scene.scene import Ground
+from masiv.splat.gaussians import Gaussians
+
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def cloud(count=40, seed=0):
+    means = torch.from_numpy(0.2 + 0.6 * np.random.default_rng(seed).random((count, 3)))
+    return Gaussians(means, torch.full((count,), 0.02).double(), torch.ones(count), torch.ones(count, 3))
+
+
+def camera():
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = 0, 1.0, 3.0  # at (0, 1, 3), looking along −z
+    return Camera("front", 64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), pose)
+
+
+def test_gaussians_follow_a_rigid_motion_exactly():
+    particles = np.random.default_rng(1).random((2000, 3))
+    gaussians = cloud()
+    turn, shift = Rotation.from_rotvec([0.3, -0.8, 0.4]), np.array([1.0, 2, -3])
+    moved = Binding.at_rest(gaussians, particles).moved(turn.apply(particles) + shift)
+    np.testing.assert_allclose(moved.means.numpy(), turn.apply(gaussians.means.numpy()) + shift, atol=1e-9)
+    np.testing.assert_allclose(moved.scales.numpy(), 0.02, rtol=1e-6)
+    at_rest = Binding.at_rest(gaussians, particles).moved(particles)
+    np.testing.assert_allclose(at_rest.means.numpy(), gaussians.means.numpy(), atol=1e-12)
+
+
+def test_gaussians_grow_with_the_body():
+    particles = np.random.default_rng(1).random((2000, 3))
+    moved = Binding.at_rest(cloud(), particles).moved(1.5 * particles)
+    assert 1.3 < float(moved.scales.mean()) / 0.02 <= 1.5
+
+
+def test_too_few_particles_are_refused():
+    with pytest.raises(InputError, match="at least 4"):
+        Binding.at_rest(cloud(), np.zeros((3, 3)))
+
+
+def test_backdrop_has_its_horizon_where_the_camera_looks_level():
+    picture = backdrop(camera(), UP, Ground(UP, 0.0), 0.5).astype(int)
+    assert picture.shape == (48, 64, 3)
+    assert len(np.unique(picture[40:].reshape(-1, 3), axis=0)) > 1  # squares near by
+    assert (np.ptp(picture[:23], axis=1) <= 3).all()  # sky above, without squares
+    assert (np.ptp(backdrop(camera(), UP, None, 0.5)[30:].astype(int), axis=(0, 1)) <= 1).all()
+
+
+def test_draw_puts_a_gaussian_where_the_camera_projects_it(taichi):
+    point = torch.tensor([[0.3, 1.2, 0.0]])
+    one = Gaussians(point, torch.tensor([0.1]), torch.tensor([0.95]), torch.tensor([[1.0, 0.0, 0.0]]))
+    picture, alpha = draw(one, camera(), np.full((48, 64, 3), 200, np.uint8))
+    pixel, _ = camera().project(point.numpy().astype(float))
+    row, column = np.unravel_index(alpha.argmax(), alpha.shape)
+    np.testing.assert_allclose([column + 0.5, row + 0.5], pixel[0], atol=1)
+    assert picture[row, column, 0] > 230
+    assert picture[row, column, 1] < 40
+    np.testing.assert_array_equal(picture[0, 0], 200)
+
+
+def test_log_gives_back_the_reported_numbers(tmp_path):
+    report = history.logged(lambda *a: None, tmp_path / "log.csv")
+    for k in range(1, 6):
+        report("fit", k, 5, f"loss {1 / k:.3f} mm, 7 frames")
+    report("fit", 5, 5, "loss 9.5 mm")  # a resumed run repeats
+    report("words", 1, 1, "nothing")
+    iterations, values, label = history.curves(tmp_path / "log.csv")["fit"]
+    assert iterations == [1, 2, 3, 4, 5]
+    assert values == [1, 0.5, 0.333, 0.25, 9.5]
+    assert label == "loss mm"
+    assert "words" not in history.curves(tmp_path / "log.csv")
+
+
+def test_page_is_self_contained_and_escapes(tmp_path):
+    page = Page("a <twin>")
+    page.table(["x"], [[1.23456], [None], ["<b>"], [[0.5, 2]]])
+    page.picture(plots.over_frames({"a": ([0, 1], [1.0, None])}, "t", "mm", 1), "plot")
+    page.write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert "a &lt;twin&gt;" in text
+    assert "1.235" in text
+    assert "(0.5, 2)" in text
+    assert "<b>" not in text
+    assert "http" not in text
+    assert number(float("inf")) == "∞"
+
+
+def test_video_and_picture_are_written_whole(tmp_path):
+    frames = [np.full((33, 47, 3), 40 * k, np.uint8) for k in range(4)]
+    write_video(tmp_path / "a" / "v.mp4", frames, 24)
+    write_png(tmp_path / "b" / "p.png", frames[1])
+    import imageio.v3 as imageio
+
+    shown = imageio.imread(tmp_path / "a" / "v.mp4")
+    assert shown.shape == (4, 34, 48, 3)
+    np.testing.assert_allclose(shown.mean(axis=(1, 2, 3)), [0, 40, 80, 120], atol=4)
+    assert sorted(p.name for p in tmp_path.rglob("*.*")) == ["p.png", "v.mp4"]
+
+
+def test_truth_and_motion_numbers(tmp_path):
+    points = np.random.default_rng(0).random((400, 3))
+    truth = points + np.arange(3)[:, None, None] * np.array([0.1, 0, 0])
+    for frame, positions in enumerate(truth):
+        np.save(tmp_path / f"particles_{frame}.npy", positions)
+    read = measure.read_truth(tmp_path, 9)
+    np.testing.assert_array_equal(read, truth)
+    late = truth.copy()
+    late[2] += [0, 0.005, 0]
+    numbers = measure.motion_numbers(late, read, [1, 2])
+    assert numbers["tracked_error_mm"] == pytest.approx(2.5, abs=1e-3)
+    assert measure.motion_numbers(truth, read, [0, 1, 2])["chamfer_1e3mm2"] == 0
+    assert measure.motion_numbers(truth, read, [3]) is None
+    np.save(tmp_path / "particles_1.npy", points[:5])
+    with pytest.raises(InputError, match="same particles"):
+        measure.read_truth(tmp_path, 9)
+    with pytest.raises(InputError, match="particles_0"):
+        measure.read_truth(tmp_path / "none", 9)
+
+
+def test_initial_motion_of_a_thrown_spinning_body():
+    from masiv.metrics import rigid_ballistic
+
+    points = np.random.default_rng(2).random((200, 3))
+    times, gravity = np.arange(4) / 24, np.array([0, -9.8, 0])
+    velocity, omega = np.array([0.5, 1, -2]), np.array([1.0, 3, -2])
+    motion = rigid_ballistic(points, velocity, omega, points.mean(0), gravity, times)
+    found_velocity, found_omega = measure.initial_motion(motion, times, gravity)
+    np.testing.assert_allclose(found_velocity, velocity, atol=1e-9)
+    np.testing.assert_allclose(found_omega, omega, atol=1e-9)
+
+
+def test_agreement_is_a_root_mean_square_without_frame_0():
+    motion = np.zeros((3, 10, 3))
+    other = motion.copy()
+    other[1, :, 0], other[2, :, 1] = 0.003, 0.004
+    block = measure.agreement(other, motion)
+    assert block["trajectory_rmse_mm"] == pytest.approx(np.sqrt(12.5))
+    assert block["frames"] == [1, 2]
+
+
+def test_table_has_a_row_a_block():
+    numbers = {
+        "schema": 1,
+        "reconstruction": {
+            "training_views": {"frames": [0, 1, 2, 5], "views": [0], "psnr_db": 20.0},
+            "held_out_views": None,
+        },
+        "fit": {"frames": [1, 2], "trajectory_rmse_mm": 3.0},
+    }
+    header, body = rows(numbers)
+    assert header == ["what", "frames", "views", "PSNR [dB]", "to trajectory [mm]"]
+    assert body[0] == ["reconstruction, training views", "0–2, 5", "0", 20.0, None]
+    assert body[1][0] == "fit"
+    assert "20" in table(numbers)

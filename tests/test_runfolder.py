@@ -1,0 +1,113 @@
+"""A run folder keeps what was asked, goes on after a kill, and refuses what differs."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+from masiv.config import load_config
+from masiv.errors import InputError, MasivError
+from masiv.runfolder import Request, RunFolder, load_motion, save_motion, write_json
+
+SCENE = {"fps": 24.0, "frames": 16, "gravity_m_s2": [0.0, -9.8, 0.0], "cameras_sha256": "ab"}
+
+
+def request(tmp_path, scene=SCENE, fit_frames=12, holdout=(3,), **changes):
+    config = load_config("quick").model_dump(mode="json")
+    for dotted, value in changes.items():
+        section, key = dotted.split("__")
+        config[section] = {**config[section], key: value}
+    return Request(config, tmp_path / "scene", scene, fit_frames, holdout)
+
+
+def test_a_new_run_says_what_was_asked(tmp_path):
+    run = RunFolder.create_or_resume(tmp_path / "a/run", request(tmp_path))
+    record = yaml.safe_load((tmp_path / "a/run/run.yaml").read_text())
+    assert record["config"] == load_config("quick").model_dump(mode="json")
+    assert record["split"] == {"fit_frames": 12, "holdout_cameras": [3]}
+    assert {s["state"] for s in record["stages"].values()} == {"pending"}
+    assert record["versions"]["numpy"] == np.__version__
+    assert (run.fit_frames, run.holdout_cameras) == (12, (3,))
+
+
+def test_stage_goes_pending_running_done(tmp_path):
+    run = RunFolder.create_or_resume(tmp_path / "run", request(tmp_path))
+    with run.stage("reconstruct") as checkpoint:
+        assert RunFolder.open(run.path).record["stages"]["reconstruct"]["state"] == "running"
+        checkpoint.save({"iteration": 3})
+    again = RunFolder.open(run.path)
+    assert again.done("reconstruct")
+    assert not again.done("trajectory")
+    assert again.seconds()["reconstruct"] >= 0
+    assert run.checkpoint("reconstruct").load() is None
+
+
+def test_a_failed_stage_keeps_its_checkpoint(tmp_path):
+    run = RunFolder.create_or_resume(tmp_path / "run", request(tmp_path))
+
+    def work():
+        with run.stage("reconstruct") as checkpoint:
+            checkpoint.save({"iteration": 3})
+            raise MasivError("full disk")
+
+    with pytest.raises(MasivError):
+        work()
+    again = RunFolder.create_or_resume(run.path, request(tmp_path))
+    assert not again.done("reconstruct")
+    assert again.checkpoint("reconstruct").load() == {"iteration": 3}
+    with pytest.raises(InputError, match="no finished reconstruct"):
+        again.require("reconstruct")
+
+
+def test_the_same_request_resumes_and_another_is_refused(tmp_path):
+    path = tmp_path / "run"
+    run = RunFolder.create_or_resume(path, request(tmp_path))
+    with run.stage("reconstruct"):
+        pass
+    RunFolder.create_or_resume(path, request(tmp_path))
+    cases = [
+        (request(tmp_path, fit_frames=10), "fit_frames 12 → 10"),
+        (request(tmp_path, holdout=()), "holdout_cameras"),
+        (request(tmp_path, scene={**SCENE, "fps": 30.0}), "scene fps 24.0 → 30.0"),
+        (request(tmp_path, reconstruct__iterations=7), "reconstruct.iterations"),
+    ]
+    for asked, message in cases:
+        with pytest.raises(InputError, match=message) as error:
+            RunFolder.create_or_resume(path, asked)
+        assert "--out" in str(error.value)
+
+
+def test_settings_of_a_stage_not_begun_may_change(tmp_path):
+    path = tmp_path / "run"
+    run = RunFolder.create_or_resume(path, request(tmp_path))
+    with run.stage("reconstruct"):
+        pass
+    RunFolder.create_or_resume(path, request(tmp_path, identify__iterations=77))
+    assert RunFolder.open(path).config["identify"]["iterations"] == 77
+    assert RunFolder.open(path).done("reconstruct")
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/cat.jpg").write_text("cat")
+    with pytest.raises(InputError, match="not a run folder"):
+        RunFolder.create_or_resume(tmp_path / "photos", request(tmp_path))
+    assert [p.name for p in (tmp_path / "photos").iterdir()] == ["cat.jpg"]
+    with pytest.raises(InputError, match="not a run folder"):
+        RunFolder.open(tmp_path)
+
+
+def test_motion_and_json_round_trip(tmp_path):
+    positions = np.random.default_rng(0).random((3, 5, 3)).astype(np.float32)
+    save_motion(tmp_path / "rollout.npz", positions, np.arange(3) / 24)
+    again, times = load_motion(tmp_path / "rollout.npz")
+    np.testing.assert_array_equal(again, positions)
+    np.testing.assert_array_equal(times, np.arange(3) / 24)
+    with pytest.raises(InputError, match="not a rollout"):
+        load_motion(tmp_path / "nothing.npz")
+    write_json(tmp_path / "a.json", {"psnr": math.inf, "n": np.float32(2), "v": np.arange(2), "p": tmp_path})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"psnr": None, "n": 2, "v": [0, 1], "p": str(tmp_path)}
