@@ -51,14 +51,14 @@ def identify(
     from masiv.mpm.simulate import simulate
     from masiv.report.numbers import run_numbers, table
     from masiv.report.report import write_report
-    from masiv.runfolder import save_motion, write_json
+    from masiv.runfolder import write_json
 
     with progress_bar() as progress:
         dynamic = stages.reconstructed(run, settings, read, progress)
         trajectory = stages.estimated(run, settings, read, progress)
         twin = stages.identified(run, settings, read, progress)
         motion = simulate(twin, frames=read.frame_count, fps=read.fps, progress=progress)
-        save_motion(run.rollout, motion.positions, motion.times)
+        motion.save(run.rollout)
         numbers = run_numbers(run, read, dynamic, trajectory, motion.positions)
         write_json(run.metrics, numbers)
         progress("report", 0, 1)

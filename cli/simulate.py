@@ -52,13 +52,12 @@ def simulate(
     stages.start(settings)
     from masiv.mpm.simulate import simulate as roll
     from masiv.report.film import film
-    from masiv.runfolder import save_motion
     from masiv.twin import Twin
 
     with progress_bar() as progress:
         motion = roll(Twin.load(run), frames=frames, fps=scene.fps, progress=progress, **given)
         target.mkdir(parents=True, exist_ok=True)
-        save_motion(target / "rollout.npz", motion.positions, motion.times)
+        motion.save(target / "rollout.npz")
         if render:
             film(scene, stages.load_dynamic(folder), motion.positions, views, target, progress=progress)
     data = {"rollout": str(target / "rollout.npz"), "frames": frames, "particles": motion.positions.shape[1]}

@@ -102,7 +102,7 @@ def estimated(run: RunFolder, config: Config, scene: Scene, progress: Progress) 
 def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Twin:
     """The run's twin, made now where it lacks it."""
     runtime.start(config.arch)
-    from masiv.identify import identify
+    from masiv.identify.stage import identify
     from masiv.twin import Twin
 
     if run.done("identify"):

@@ -23,30 +23,18 @@ def synth(
 
     Example: `masiv synth assets/sample.yaml --out scenes/sample`
     """
-    import shutil
-
     from masiv import runtime
     from masiv.cli.console import progress_bar
     from masiv.config import load_config
-    from masiv.errors import InputError
     from masiv.strict import read_yaml, validated
-    from masiv.synth.config import SynthSpec
+    from masiv.synth.spec import SynthSpec
 
     settings = load_config(preset, config, seed=seed, arch=arch)
-    overrides = {} if seed is None else {"seed": seed}
-    request = validated(SynthSpec, {**read_yaml(spec), **overrides}, str(spec))
-    if out.exists():
-        raise InputError(f"{out} exists: give a new folder with --out")
+    given = {} if seed is None else {"seed": seed}
+    request = validated(SynthSpec, {**read_yaml(spec), **given}, str(spec))
     runtime.start(settings.arch)
-    from masiv.synth.make import synthesise
+    from masiv.synth.synthesise import synthesise
 
-    out.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = out.with_name(out.name + ".unfinished")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    try:
-        with progress_bar() as progress:
-            synthesise(request, unfinished, progress=progress)
-        unfinished.rename(out)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+    with progress_bar() as progress:
+        synthesise(request, out, progress=progress)
     return {"scene": str(out)}, f"{out}: masiv inspect {out} shows it"

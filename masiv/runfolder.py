@@ -194,15 +194,8 @@ class RunFolder:
         os.replace(temporary, self.path / "run.yaml")
 
 
-def save_motion(path: Path, positions: np.ndarray, times: np.ndarray) -> None:
-    """Write positions (T, Q, 3) float32 [m, world] and times (T,) [s] as rollout.npz has them."""
-    temporary = path.with_name(path.stem + ".tmp.npz")
-    np.savez_compressed(temporary, positions=np.asarray(positions, np.float32), times=np.asarray(times, np.float64))
-    os.replace(temporary, path)
-
-
 def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (T, Q, 3) and times (T,) that ``save_motion`` wrote. Raises InputError."""
+    """Positions (T, Q, 3) float32 [m, world] and times (T,) [s] of a rollout.npz. Raises InputError."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return file["positions"], file["times"]

@@ -11,7 +11,7 @@ import yaml
 
 from masiv.config import load_config
 from masiv.errors import InputError, MasivError
-from masiv.runfolder import Request, RunFolder, load_motion, save_motion, write_json
+from masiv.runfolder import Request, RunFolder, load_motion, write_json
 
 SCENE = {"fps": 24.0, "frames": 16, "gravity_m_s2": [0.0, -9.8, 0.0], "cameras_sha256": "ab"}
 
@@ -103,7 +103,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
 
 def test_motion_and_json_round_trip(tmp_path):
     positions = np.random.default_rng(0).random((3, 5, 3)).astype(np.float32)
-    save_motion(tmp_path / "rollout.npz", positions, np.arange(3) / 24)
+    np.savez(tmp_path / "rollout.npz", positions=positions, times=np.arange(3) / 24)
     again, times = load_motion(tmp_path / "rollout.npz")
     np.testing.assert_array_equal(again, positions)
     np.testing.assert_array_equal(times, np.arange(3) / 24)

@@ -1,0 +1,101 @@
+"""A scene in numbers, for ``masiv inspect`` and for run folders."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from masiv.scene.scene import Scene
+
+
+def identity(scene: Scene) -> dict[str, Any]:
+    """What tells two scenes apart: conventions, a digest of the cameras and one of the first and last picture."""
+    cameras, pictures = hashlib.sha256(), hashlib.sha256()
+    for camera in scene.cameras:
+        cameras.update(np.round([*camera.intrinsics.ravel(), *camera.world_to_camera.ravel()], 6).tobytes())
+    visible = scene.views
+    for view, frame in ((visible[0], 0), (visible[-1], scene.frame_count - 1)):
+        pictures.update(scene.frame(view, frame).image.tobytes())
+        pictures.update(scene.frame(view, frame).mask.tobytes())
+    ground = None
+    if scene.ground is not None:
+        ground = {"normal": scene.ground.normal.tolist(), "height_m": float(scene.ground.height)}
+    return {
+        "layout": scene.layout,
+        "fps": float(scene.fps),
+        "frames": scene.frame_count,
+        "views": len(scene.cameras),
+        "up": scene.up.tolist(),
+        "gravity_m_s2": scene.gravity.tolist(),
+        "ground": ground,
+        "density_kg_m3": float(scene.density),
+        "mask_source": scene.mask_source,
+        "cameras_sha256": cameras.hexdigest()[:16],
+        "pictures_sha256": pictures.hexdigest()[:16],
+    }
+
+
+def summarise(scene: Scene) -> dict[str, Any]:
+    """Everything that ``masiv inspect`` says. Reads every picture; those that show nothing become problems."""
+    problems = list(scene.problems)
+    coverage = np.zeros((len(scene.views), scene.frame_count))
+    for row, view in enumerate(scene.views):
+        for frame in range(scene.frame_count):
+            picture = scene.frame(view, frame)
+            coverage[row, frame] = picture.mask.mean()
+            if picture.valid.any() and coverage[row, frame] == 0:
+                problems.append(f"view {view} at frame {frame}: the mask is empty")
+            elif coverage[row, frame] > 0.6:
+                problems.append(
+                    f"view {view} at frame {frame}: the mask covers {coverage[row, frame]:.0%} of the picture"
+                )
+    return {
+        "scene": str(scene.path),
+        **identity(scene),
+        "duration_s": (scene.frame_count - 1) / scene.fps,
+        "fit_frames": scene.fit_frames,
+        "mask_coverage": {"mean": coverage.mean(), "min": coverage.min(), "max": coverage.max()},
+        "cameras": [
+            {
+                "name": camera.name,
+                "width_px": camera.width,
+                "height_px": camera.height,
+                "focal_px": [float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])],
+                "principal_point_px": [float(camera.intrinsics[0, 2]), float(camera.intrinsics[1, 2])],
+                "position_m": camera.centre.tolist(),
+            }
+            for camera in scene.cameras
+        ],
+        "problems": problems,
+    }
+
+
+def as_text(summary: dict[str, Any]) -> str:
+    """``summarise``'s answer for a person."""
+
+    def numbers(values: list[float]) -> str:
+        return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+    ground = summary["ground"]
+    plane = "none" if ground is None else f"normal {numbers(ground['normal'])}, height {ground['height_m']:.4g} m"
+    coverage = summary["mask_coverage"]
+    lines = [
+        f"{summary['scene']}: {summary['layout']} layout",
+        f"frames   {summary['frames']} at {summary['fps']:.6g} fps, {summary['duration_s']:.3f} s",
+        f"units    metres, seconds; up {numbers(summary['up'])}; gravity {numbers(summary['gravity_m_s2'])} m/s²",
+        f"ground   {plane}",
+        f"density  {summary['density_kg_m3']:.6g} kg/m³",
+        f"masks    {summary['mask_source']}; cover {coverage['mean']:.1%} of a picture "
+        f"({coverage['min']:.1%} to {coverage['max']:.1%})",
+        f"cameras  {summary['views']}",
+    ]
+    lines += [
+        f"  {index:2d} {camera['name']:10s} {camera['width_px']}×{camera['height_px']}"
+        f"  focal {camera['focal_px'][0]:.1f} px  at {numbers(camera['position_m'])} m"
+        for index, camera in enumerate(summary["cameras"])
+    ]
+    lines += ["problems " + ("none" if not summary["problems"] else "")]
+    lines += [f"  - {problem}" for problem in summary["problems"]]
+    return "\n".join([*lines, f"picture  {summary['picture']}"])
