@@ -29,7 +29,7 @@ class ReconstructConfig(BaseModel):
     growth_share: float = Field(0.5, ge=0, le=0.9, description="share of the steps in which the other frames come in")
 
     means_rate: float = Field(2e-3, gt=0, description="step of positions at first")
-    motion_rate: float = Field(3e-3, gt=0, description="step of the networks' weights at first")
+    motion_rate: float = Field(5e-3, gt=0, description="step of the networks' weights at first")
     base_rate: float = Field(3e-3, gt=0, description="step of the base motion at first")
     scale_rate: float = Field(1e-2, gt=0, description="step of log sizes at first")
     opacity_rate: float = Field(3e-2, gt=0, description="step of opacity logits at first")
@@ -38,7 +38,8 @@ class ReconstructConfig(BaseModel):
 
     ssim_weight: float = Field(0.2, ge=0, le=1, description="of 1 - SSIM; the rest is L1")
     alpha_weight: float = Field(0.5, ge=0, description="of alpha against the mask")
-    scale_weight: float = Field(0.02, ge=0, description="of the mean size over its first value")
-    rigidity_weight: float = Field(0.3, ge=0, description="of squared strain between neighbours")
+    scale_weight: float = Field(0.002, ge=0, description="of the mean size over its first value")
+    rigidity_weight: float = Field(0.1, ge=0, description="of squared strain between neighbours")
+    hull_weight: float = Field(0.5, ge=0, description="of the distance to a frame's hull; fades out by the end")
     neighbours: int = Field(8, ge=1, description="neighbours a Gaussian in the rigidity term")
     prune_opacity: float = Field(0.02, ge=0, lt=1, description="Gaussians below it are removed")

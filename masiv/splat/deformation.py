@@ -96,6 +96,10 @@ class DeformationNetwork(torch.nn.Module):
         times = torch.as_tensor(times, dtype=positions.dtype, device=positions.device)
         return self._evaluate(positions, times)[..., :3]
 
+    def base_displacements(self, times: torch.Tensor) -> torch.Tensor:
+        """The base motion's share of a displacement at ``times`` (K,) [s]: (K, 3) [m]."""
+        return self._base(times * self.fps) - self.base_motion[0]
+
     def _evaluate(self, positions: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
         """(N, 3), (K,) -> (K, N, 4): displacement [m] and change of log scale."""
         s = self.settings
@@ -107,8 +111,9 @@ class DeformationNetwork(torch.nn.Module):
         hidden = self.space_input(_encode(x, s["space_octaves"]))[None] + self.time_input(encoded)[:, None]
         weights = self.coefficients(torch.nn.functional.silu(hidden))
         moved = weights @ basis
-        base = self._base(times * s["fps"]) - self.base_motion[0]
-        return torch.cat([moved[..., :3] * s["half_extent"] + base[:, None], moved[..., 3:]], dim=-1)
+        return torch.cat(
+            [moved[..., :3] * s["half_extent"] + self.base_displacements(times)[:, None], moved[..., 3:]], dim=-1
+        )
 
     def _base(self, frames: torch.Tensor) -> torch.Tensor:
         """The cubic spline through the base motion at fractional frames (K,) -> (K, 3) [m]."""

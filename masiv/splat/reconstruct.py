@@ -17,11 +17,14 @@ from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.gaussians import Gaussians
 from masiv.splat.losses import neighbour_pairs, ssim, strain
 from masiv.splat.observe import Observation, observe
+from masiv.splat.pull import HullPull, continue_motion
 from masiv.splat.rasteriser import render
 from masiv.splat.start import Start, starting_point
 
 __all__ = ["DynamicGaussians", "reconstruct"]
 
+_PULLED = 700
+"""Gaussians, and points of a hull, that one step measures."""
 _NAMES = ("means", "log_scales", "opacity_logits", "colour_logits")
 
 
@@ -53,17 +56,16 @@ class _Fit:
         self.observations = _observations(scene, config)
         self.identity = repr((config.model_dump(), seed, str(scene.path), scene.frame_count, scene.views))
         progress("reconstruct", 0, config.iterations, "carving hulls")
-        resumed = state is not None and state["identity"] == self.identity
-        start = (
-            None
-            if resumed
-            else starting_point(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
-        )
-        self._resume(state) if start is None else self._begin(start)
+        start = starting_point(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
+        self.first_scale, self.half_extent = start.scale, start.half_extent
+        self.pulls = [HullPull(hull) for hull in start.hulls]
+        if state is not None and state["identity"] == self.identity:
+            self._resume(state)
+        else:
+            self._begin(start)
 
     def _begin(self, start: Start) -> None:
         self.iteration = 0
-        self.first_scale, self.half_extent = start.scale, start.half_extent
         self.parameters = {
             "means": torch.tensor(start.means, dtype=torch.float32),
             "log_scales": torch.full((len(start.means),), float(np.log(start.scale))),
@@ -77,7 +79,6 @@ class _Fit:
 
     def _resume(self, state: dict) -> None:
         self.iteration = state["iteration"]
-        self.first_scale, self.half_extent = state["first_scale"], state["half_extent"]
         self.parameters = state["parameters"]
         self.network = self._network(state["network"]["centre"], state["network"]["base_motion"])
         self.network.load_state_dict(state["network"])
@@ -90,8 +91,6 @@ class _Fit:
         return {
             "identity": self.identity,
             "iteration": self.iteration,
-            "first_scale": self.first_scale,
-            "half_extent": self.half_extent,
             "parameters": {name: value.detach() for name, value in self.parameters.items()},
             "network": self.network.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -137,6 +136,12 @@ class _Fit:
             return 1
         return min(count, 2 + int(done / max(c.growth_share, 1e-9) * (count - 1)))
 
+    @property
+    def settling(self) -> float:
+        """0 until all frames are in, then up to 1: steps shrink and the hulls' pull fades along it."""
+        grown = self.config.first_frame_share + self.config.growth_share
+        return max(0.0, (self.iteration / self.config.iterations - grown) / (1 - grown))
+
     def canonical(self) -> Gaussians:
         p = {name: value.detach() for name, value in self.parameters.items()}
         return Gaussians(
@@ -152,10 +157,10 @@ class _Fit:
         chosen = rng.permutation(len(shown))[: c.views]
         background = torch.tensor(rng.random(3), dtype=torch.float32)
         for group in self.optimiser.param_groups:
-            group["lr"] = group["rate"] * c.final_rate ** (self.iteration / c.iterations)
+            group["lr"] = group["rate"] * c.final_rate**self.settling
 
         self.optimiser.zero_grad(set_to_none=True)
-        loss = self._loss(frame, [shown[k] for k in chosen], background)
+        loss = self._loss(frame, [shown[k] for k in chosen], background, rng)
         value = float(loss.detach())
         if not np.isfinite(value):
             raise MasivError(
@@ -164,7 +169,10 @@ class _Fit:
             )
         loss.backward()
         self.optimiser.step()
+        frames = self.frames
         self.iteration += 1
+        if self.frames > frames:
+            self._continue_motion(rng)
         if self.iteration in self._pruning_steps():
             self._prune()
         return value
@@ -175,7 +183,9 @@ class _Fit:
             return self.frames - 1
         return int(rng.integers(self.frames))
 
-    def _loss(self, frame: int, shown: list[Observation], background: torch.Tensor) -> torch.Tensor:
+    def _loss(
+        self, frame: int, shown: list[Observation], background: torch.Tensor, rng: np.random.Generator
+    ) -> torch.Tensor:
         c, p = self.config, self.parameters
         means, log_scales = p["means"], p["log_scales"]
         regulariser = c.scale_weight * log_scales.exp().mean() / self.first_scale
@@ -186,6 +196,9 @@ class _Fit:
                 stretched = strain(means.detach(), displacement, *self.pairs, softening=self.first_scale)
                 regulariser = regulariser + c.rigidity_weight * stretched
             means, log_scales = means + displacement, log_scales + log_change
+            if c.hull_weight > 0 and self.settling < 1:
+                far = self.pulls[frame](p["means"].detach() + displacement, _PULLED, rng)
+                regulariser = regulariser + c.hull_weight * (1 - self.settling) * far / self.half_extent
         scales, opacities, colours = (
             log_scales.exp(),
             torch.sigmoid(p["opacity_logits"]),
@@ -196,6 +209,9 @@ class _Fit:
             drawn = render(view.camera, means, scales, opacities, colours, background)
             total = total + _difference(drawn.rgb, drawn.alpha, view, background, c)
         return total / len(shown) + regulariser
+
+    def _continue_motion(self, rng: np.random.Generator) -> None:
+        continue_motion(self.network, self.parameters["means"].detach(), self.frames - 1, self.config.motion_rate, rng)
 
     def _pruning_steps(self) -> tuple[int, ...]:
         """After frame 0 alone, and twice while all frames are in."""

@@ -14,7 +14,7 @@ from masiv.scene.scene import Scene
 @dataclass(frozen=True)
 class Start:
     """means (N, 3) [m]; scale [m]; colours (N, 3) in [0, 1]; centre (3,) and half_extent [m] of the first hull;
-    base_motion (T, 3) [m], centroids of the hulls relative to frame 0."""
+    base_motion (T, 3) [m], centroids of the hulls relative to frame 0; hulls of the T frames."""
 
     means: np.ndarray
     scale: float
@@ -22,14 +22,15 @@ class Start:
     centre: np.ndarray
     half_extent: float
     base_motion: np.ndarray
+    hulls: tuple[VisualHull, ...]
 
 
 def starting_point(scene: Scene, count: int, resolution: int, rng: np.random.Generator) -> Start:
     """Start from the visual hulls of ``scene``. Raises MasivError where a hull is empty, as ``visual_hull`` does."""
     hull = visual_hull(scene, 0, resolution=resolution)
-    centroids = [hull.points.mean(axis=0)]
-    for frame in range(1, scene.frame_count):
-        centroids.append(visual_hull(scene, frame, resolution=max(8, resolution // 2)).points.mean(axis=0))
+    later = [visual_hull(scene, f, resolution=max(8, resolution // 2)) for f in range(1, scene.frame_count)]
+    hulls = (hull, *later)
+    centroids = np.stack([h.points.mean(axis=0) for h in hulls])
     shell = hull.points[hull.surface]
     if len(shell) < 2:
         raise MasivError(f"the visual hull of frame 0 of {scene.path} is a single voxel: raise hull_resolution")
@@ -43,7 +44,8 @@ def starting_point(scene: Scene, count: int, resolution: int, rng: np.random.Gen
         colours=_colours(scene, hull, means),
         centre=(low + high) / 2,
         half_extent=float((high - low).max() / 2 + hull.spacing),
-        base_motion=np.stack(centroids) - centroids[0],
+        base_motion=centroids - centroids[0],
+        hulls=hulls,
     )
 
 
