@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from masiv.cli.options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption
 
 
 def evaluate(
@@ -25,8 +25,8 @@ def evaluate(
 
     Example: `masiv evaluate runs/bunny --truth scenes/bunny/gt`
     """
-    from masiv.cli import stages
-    from masiv.cli.console import progress_bar
+    from . import stages
+    from .console import progress_bar
 
     folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
     folder.require("trajectory")

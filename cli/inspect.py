@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from masiv.cli.options import ArchOption, ConfigOption, JsonOption, PresetOption, SceneArgument, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SceneArgument, SeedOption
 
 
 def inspect(

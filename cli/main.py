@@ -6,15 +6,15 @@ import sys
 
 import typer
 
-from masiv.cli import console
-from masiv.cli.evaluate import evaluate
-from masiv.cli.identify import identify
-from masiv.cli.inspect import inspect
-from masiv.cli.pretrain import pretrain
-from masiv.cli.reconstruct import reconstruct
-from masiv.cli.simulate import simulate
-from masiv.cli.synth import synth
-from masiv.cli.trajectory import trajectory
+from . import console
+from .evaluate import evaluate
+from .identify import identify
+from .inspect import inspect
+from .pretrain import pretrain
+from .reconstruct import reconstruct
+from .simulate import simulate
+from .synth import synth
+from .trajectory import trajectory
 
 app = typer.Typer(
     name="masiv",

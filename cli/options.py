@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    import numpy as np
 
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a scene.", show_default=False)]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.", show_default=False)]
@@ -24,9 +27,11 @@ HoldoutOption = Annotated[
 ]
 
 
-def vector(text: str | None, flag: str) -> tuple[float, float, float] | None:
-    """'1,2.5,-3' as three finite numbers. Raises InputError."""
+def vector(text: str | None, flag: str) -> np.ndarray | None:
+    """'1,2.5,-3' as an array of three finite numbers. Raises InputError."""
     import math
+
+    import numpy as np
 
     from masiv.errors import InputError
 
@@ -38,4 +43,4 @@ def vector(text: str | None, flag: str) -> tuple[float, float, float] | None:
         values = ()
     if len(values) != 3 or not all(map(math.isfinite, values)):
         raise InputError(f"{flag} {text}: give three finite numbers with commas, for example {flag}=0,-1.5,0")
-    return values[0], values[1], values[2]
+    return np.array(values)

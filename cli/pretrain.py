@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from masiv.cli.options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption
 
 
 def pretrain(
@@ -28,8 +28,9 @@ def pretrain(
     Example: `masiv pretrain jelly --out jelly.safetensors`
     """
     from masiv import runtime
-    from masiv.cli.console import progress_bar
     from masiv.config import load_config
+
+    from .console import progress_bar
 
     settings = load_config(preset, config, seed=seed, arch=arch)
     target = out or Path(f"{material}.safetensors")

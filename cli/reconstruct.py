@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from masiv.cli.options import (
+from .options import (
     ArchOption,
     ConfigOption,
     FitFramesOption,
@@ -34,8 +34,8 @@ def reconstruct(
 
     Example: `masiv reconstruct scenes/bunny --out runs/bunny --preset quick --holdout-camera 3`
     """
-    from masiv.cli import stages
-    from masiv.cli.console import progress_bar
+    from . import stages
+    from .console import progress_bar
 
     run, settings, read = stages.open_run(
         scene,

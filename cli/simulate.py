@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from masiv.cli.options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, vector
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, vector
 
 
 def simulate(
@@ -33,9 +33,10 @@ def simulate(
 
     Example: `masiv simulate runs/bunny --frames 32 --velocity=1,2,0 --gravity=0,-1.6,0 --out moon --render`
     """
-    from masiv.cli import stages
-    from masiv.cli.console import progress_bar
     from masiv.errors import InputError
+
+    from . import stages
+    from .console import progress_bar
 
     given = {
         "velocity": vector(velocity, "--velocity"),

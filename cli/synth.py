@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from masiv.cli.options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption
 
 
 def synth(
@@ -24,10 +24,11 @@ def synth(
     Example: `masiv synth assets/sample.yaml --out scenes/sample`
     """
     from masiv import runtime
-    from masiv.cli.console import progress_bar
     from masiv.config import load_config
     from masiv.strict import read_yaml, validated
     from masiv.synth.spec import SynthSpec
+
+    from .console import progress_bar
 
     settings = load_config(preset, config, seed=seed, arch=arch)
     given = {} if seed is None else {"seed": seed}

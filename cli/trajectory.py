@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from masiv.cli.options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption
 
 
 def trajectory(
@@ -19,8 +19,8 @@ def trajectory(
 
     Example: `masiv trajectory runs/bunny`
     """
-    from masiv.cli import stages
-    from masiv.cli.console import progress_bar
+    from . import stages
+    from .console import progress_bar
 
     folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
     with progress_bar() as progress:

@@ -28,10 +28,10 @@ class Config(BaseModel):
     preset: Preset = DEFAULT_PRESET
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     arch: Literal["cpu", "cuda", "vulkan"] = "cpu"
-    reconstruct: ReconstructConfig = ReconstructConfig()
-    trajectory: TrajectoryConfig = TrajectoryConfig()
-    simulator: SimulatorConfig = SimulatorConfig()
-    identify: IdentifyConfig = IdentifyConfig()
+    reconstruct: ReconstructConfig = ReconstructConfig.model_validate({})
+    trajectory: TrajectoryConfig = TrajectoryConfig.model_validate({})
+    simulator: SimulatorConfig = SimulatorConfig.model_validate({})
+    identify: IdentifyConfig = IdentifyConfig.model_validate({})
 
 
 def load_config(

@@ -137,5 +137,5 @@ def initial_motion(positions: np.ndarray, times: np.ndarray, gravity: np.ndarray
     step = float(times[1] - times[0])
     before, after = positions[0].astype(np.float64), positions[1].astype(np.float64)
     velocity = (after.mean(0) - before.mean(0)) / step - 0.5 * gravity * step
-    rotation, _ = Rotation.align_vectors(after - after.mean(0), before - before.mean(0))
+    rotation = Rotation.align_vectors(after - after.mean(0), before - before.mean(0))[0]
     return velocity, rotation.as_rotvec() / step

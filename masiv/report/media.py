@@ -37,7 +37,7 @@ def write_video(path: Path, images: Iterable[np.ndarray], fps: float, repeat: in
             writer = imageio_ffmpeg.write_frames(
                 str(temporary),
                 size,
-                fps=fps,
+                fps=fps,  # pyright: ignore[reportArgumentType] a fraction is fine for ffmpeg
                 quality=8,
                 macro_block_size=2,
                 pix_fmt_out="yuv420p",

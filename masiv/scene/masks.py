@@ -71,7 +71,7 @@ def _refined(image: np.ndarray, difference: np.ndarray, noise: float, shadow: np
     cv2.setRNGSeed(0)  # GrabCut's colour clusters start from OpenCV's random numbers
     bgr = np.ascontiguousarray(image[..., ::-1])
     try:
-        cv2.grabCut(bgr, trimap, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(bgr, trimap, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
     except cv2.error:
         return seed.astype(np.float32)  # one class is empty: nothing to refine
     return _cleaned((trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)).astype(np.float32)

@@ -213,11 +213,12 @@ def _crop(camera: Camera, corners: np.ndarray) -> np.ndarray:
 
 def _pixels(path: Path) -> np.ndarray:
     """(H, W, 3) RGB or (H, W, 4) RGBA, uint8."""
-    raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if raw is None:
+    decoded = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if decoded is None:
         raise InputError(f"{path} cannot be read as a picture: replace it or remove it from the listing")
+    raw = np.asarray(decoded)
     if raw.dtype == np.uint16:
-        raw = (raw >> 8).astype(np.uint8)
+        raw = (raw // 256).astype(np.uint8)
     if raw.ndim == 2:
         return np.repeat(raw[..., None], 3, axis=-1)
     return np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[-1]]])

@@ -1,0 +1,39 @@
+# From a fresh clone, with python3 (3.10 or newer) and make alone: `make demo`, `make test`.
+PYTHON ?= python3
+VENV ?= .venv
+ARCH ?= cpu
+# Plain `torch` on Linux brings gigabytes of CUDA; the CPU index has the same version without. Set TORCH_INDEX= to have the former.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+EXTRA_INDEX = $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+BIN = $(VENV)/bin
+INSTALLED = $(VENV)/installed
+RUN = runs/demo
+
+.PHONY: demo test lint bench clean install
+
+install: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --retries 1 --upgrade pip
+	$(BIN)/python -m pip install --quiet --retries 1 $(EXTRA_INDEX) -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: $(INSTALLED)
+	$(BIN)/masiv identify assets/sample --out $(RUN) --preset quick --arch $(ARCH)
+	$(BIN)/masiv evaluate $(RUN) --truth assets/sample/gt --arch $(ARCH)
+	@echo "open $(RUN)/report.html"
+
+test: lint
+	$(BIN)/python -m pytest
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: $(INSTALLED)
+	for file in benchmarks/*.py; do $(BIN)/python $$file || exit 1; done
+
+clean:
+	rm -rf $(VENV) build runs *.egg-info .pytest_cache .ruff_cache .hypothesis
