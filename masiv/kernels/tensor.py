@@ -15,10 +15,16 @@ def deviator(a):
 
 
 @ti.func
+def power_of_third(x, n: ti.template()):
+    """x^(n / 3). A literal exponent would be rounded to float32 in a float64 kernel."""
+    return ti.exp(n * ti.log(x) / 3.0)
+
+
+@ti.func
 def isochoric_strain(f):
     """det F, the isochoric left Cauchy-Green tensor J^(-2/3) F F^T, and its inverse."""
     j = f.determinant()
-    b = ti.pow(j, -2.0 / 3.0) * (f @ f.transpose())
+    b = power_of_third(j, -2) * (f @ f.transpose())
     return j, b, b.inverse()
 
 
@@ -42,14 +48,14 @@ def neural_flow(f, c):
     q = 0.5 * (b.trace() + b_inverse.trace()) - 3.0
     half = (0.125 * c[0] / ti.sqrt(1.0 + q / 3.0)) * deviator(b - b_inverse)
     m = (identity3() + half).inverse() @ (identity3() - half)
-    return (ti.pow(m.determinant(), -1.0 / 3.0) * ti.pow(j, -c[1] / 3.0)) * (m @ f)
+    return (power_of_third(m.determinant(), -1) * ti.pow(j, -c[1] / 3.0)) * (m @ f)
 
 
 @ti.func
 def isochoric_adjoint(f, j, b, b_bar, j_bar):
     """Adjoint of (J, b) = (det F, J^(-2/3) F F^T) with respect to F."""
-    along_j = j_bar * j - (2.0 / 3.0) * (b_bar * b).sum()
-    return ti.pow(j, -2.0 / 3.0) * ((b_bar + b_bar.transpose()) @ f) + along_j * f.inverse().transpose()
+    along_j = j_bar * j - 2.0 * (b_bar * b).sum() / 3.0
+    return power_of_third(j, -2) * ((b_bar + b_bar.transpose()) @ f) + along_j * f.inverse().transpose()
 
 
 @ti.func
@@ -76,7 +82,7 @@ def neural_flow_adjoint(f, c, out_bar):
     half = (c[0] * per_share) * direction
     a_inverse = (identity3() + half).inverse()
     m = a_inverse @ (identity3() - half)
-    scale = ti.pow(m.determinant(), -1.0 / 3.0) * ti.pow(j, -c[1] / 3.0)
+    scale = power_of_third(m.determinant(), -1) * ti.pow(j, -c[1] / 3.0)
     log_scale_bar = scale * (out_bar * (m @ f)).sum()
     m_bar = scale * (out_bar @ f.transpose()) - (log_scale_bar / 3.0) * m.inverse().transpose()
     half_bar = -1.0 * (a_inverse.transpose() @ m_bar @ (m.transpose() + identity3()))
@@ -116,7 +122,7 @@ def neo_hookean(f, c):
 def water(f, c):
     """c = (lambda,) [Pa]. tau = lambda J (J - 1) I, and F keeps only its volume (NCLaw, Ma et al. 2023)."""
     j = f.determinant()
-    return ti.pow(j, 1.0 / 3.0) * identity3(), c[0] * j * (j - 1.0) * identity3()
+    return power_of_third(j, 1) * identity3(), c[0] * j * (j - 1.0) * identity3()
 
 
 @ti.func

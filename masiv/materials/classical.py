@@ -51,6 +51,11 @@ class ClassicalLaw(Law):
             {name: torch.nn.Parameter(torch.tensor(float(parameters[name]), dtype=torch.float64)) for name in PARAMETERS[kind]}
         )
 
+    @classmethod
+    def from_state(cls, kind: str, state: dict[str, torch.Tensor]) -> ClassicalLaw:
+        """The law whose ``state_dict`` is ``state``."""
+        return cls(kind, **{name.removeprefix("values."): float(value) for name, value in state.items()})
+
     def coefficients(self) -> torch.Tensor:
         """What the kernels take, shape (K,): see the ``c`` of each function in ``masiv.kernels.tensor``."""
         mu, lam = lame(self.values["youngs_modulus"], self.values["poissons_ratio"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -55,3 +56,15 @@ class Law(torch.nn.Module, ABC):
     @abstractmethod
     def description(self) -> dict[str, Any]:
         """What ``twin.yaml`` says of the law: kind and readable parameters with units."""
+
+    def file_metadata(self) -> dict[str, str]:
+        """What a file of this law needs besides its weights to be read again."""
+        return {"kind": self.kind}
+
+    def save(self, path: Path) -> None:
+        """Write the weights as safetensors, complete or not at all. ``masiv.materials.load.load_law`` reads them."""
+        from safetensors.torch import save_file
+
+        temporary = path.with_suffix(".tmp")
+        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, temporary, metadata=self.file_metadata())
+        temporary.replace(path)

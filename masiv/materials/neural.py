@@ -14,12 +14,10 @@ from __future__ import annotations
 
 import functools
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from masiv.errors import InputError
 from masiv.materials.law import BoundLaw, Law
 
 if TYPE_CHECKING:
@@ -116,29 +114,8 @@ class NeuralLaw(Law):
             },
         }
 
-    def save(self, path: Path) -> None:
-        """Write weights as safetensors, atomically."""
-        from safetensors.torch import save_file
-
-        temporary = path.with_suffix(".tmp")
-        metadata = {"kind": self.kind, "width": str(self.width)}
-        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, temporary, metadata=metadata)
-        temporary.replace(path)
-
-    @classmethod
-    def load(cls, path: Path) -> NeuralLaw:
-        """Read what ``save`` wrote. Raises InputError for anything else."""
-        from safetensors import SafetensorError, safe_open
-
-        try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-            law = cls(width=int(metadata["width"]))
-            law.load_state_dict(state)
-        except (SafetensorError, FileNotFoundError, KeyError, RuntimeError) as error:
-            raise InputError(f"{path} is not a law written by masiv ({error}): run identify or pretrain again") from error
-        return law
+    def file_metadata(self) -> dict[str, str]:
+        return {"kind": self.kind, "width": str(self.width)}
 
 
 def _network(width: int, outputs: int, generator: torch.Generator) -> torch.nn.Sequential:

@@ -1,0 +1,153 @@
+"""The joint fit of law, initial velocity and effective ground through the rollout."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from masiv.checkpoint import Checkpoint
+from masiv.errors import MasivError, NonFiniteError
+from masiv.identify.problem import Motion, Problem
+from masiv.identify.silhouette import silhouette_error
+from masiv.materials.neural import NeuralLaw
+from masiv.progress import Progress
+
+FAILURES_ALLOWED = 8
+
+
+@dataclass
+class Fit:
+    """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; history: (iteration,
+    frames, trajectory error [m], silhouette error)."""
+
+    law: NeuralLaw
+    motion: Motion
+    error_m: float = math.inf
+    history: list[tuple[int, int, float, float]] = field(default_factory=list)
+
+
+def fit(
+    problem: Problem,
+    law: NeuralLaw,
+    motion: Motion,
+    contact: str,
+    first_frames: int,
+    *,
+    seed: int,
+    checkpoint: Checkpoint,
+    progress: Progress,
+) -> Fit:
+    """Adam on a horizon that grows from ``first_frames`` to all frames over the first half of the iterations.
+
+    A rollout that diverges is not repaired: the step is taken back and the step sizes are halved; after several in a row the
+    stage stops. Returns the parameters with the least error over all frames. Raises MasivError.
+    """
+    config = problem.config
+    law = copy.deepcopy(law)
+    motion = Motion(*(t.detach().clone().requires_grad_() for t in motion.tensors()))
+    scales = [law.log_stress_scale, law.log_flow_strain]
+    weights = [*law.elastic.parameters(), *law.plastic.parameters()]
+    groups = [
+        (weights, config.law_learning_rate),
+        (scales, config.scale_learning_rate),
+        ([motion.velocity, motion.omega], config.velocity_learning_rate),
+        ([motion.ground_offset], config.ground_learning_rate),
+    ]
+    optimiser = torch.optim.Adam([{"params": p, "lr": rate, "rate": rate} for p, rate in groups], betas=(0.9, 0.95))
+    parameters = [*weights, *scales, *motion.tensors()]
+    best = Fit(copy.deepcopy(law), Motion(*(t.detach().clone() for t in motion.tensors())))
+    first, caution, failures = 0, 1.0, 0
+    saved = checkpoint.load()
+    if saved is not None and "fit" in saved:
+        first, caution, failures = _restore(saved["fit"], parameters, optimiser, best)
+    accepted = [p.detach().clone() for p in parameters]
+    for i in range(first, config.iterations):
+        checkpoint.maybe_save(lambda i=i: {"fit": _state(i, caution, failures, parameters, optimiser, best)})
+        frames = _horizon(i, config.iterations, first_frames, problem.frames)
+        decay = 0.5 * (1 + math.cos(math.pi * i / config.iterations))
+        for group in optimiser.param_groups:
+            group["lr"] = group["rate"] * caution * (0.05 + 0.95 * decay)
+        optimiser.zero_grad()
+        try:
+            positions = problem.run(law, motion, contact, frames)
+            error = problem.error(positions)
+            silhouette = _silhouette(problem, positions, frames, seed, i)
+            loss = config.trajectory_weight * error / problem.size + config.silhouette_weight * silhouette
+            loss.backward()
+            if not all(torch.isfinite(p.grad).all() for p in parameters if p.grad is not None):
+                raise NonFiniteError(frames * problem.substeps(law), 0, "the adjoint overflowed")
+        except NonFiniteError as diverged:
+            failures, caution = failures + 1, caution / 2
+            if failures > FAILURES_ALLOWED:
+                raise MasivError(f"identify: the fit keeps diverging ({diverged})") from diverged
+            with torch.no_grad():
+                for parameter, value in zip(parameters, accepted, strict=True):
+                    parameter.copy_(value)
+            continue
+        failures = 0
+        accepted = [p.detach().clone() for p in parameters]
+        best.history.append((i, frames, float(error.detach()), float(silhouette.detach())))
+        if frames == problem.frames and float(error.detach()) < best.error_m:
+            best.error_m = float(error.detach())
+            best.law = copy.deepcopy(law)
+            best.motion = Motion(*(t.detach().clone() for t in motion.tensors()))
+        for group in optimiser.param_groups:
+            torch.nn.utils.clip_grad_norm_(group["params"], 1.0)
+        optimiser.step()
+        with torch.no_grad():
+            motion.ground_offset.clamp_(-config.ground_range, config.ground_range)
+        progress("identify: fit", i + 1, config.iterations, f"{1e3 * best.history[-1][2]:.1f} mm over {frames} frames")
+    return best
+
+
+def _horizon(iteration: int, iterations: int, first: int, last: int) -> int:
+    grown = first + (last - first) * min(1.0, 2 * iteration / max(iterations, 1))
+    return min(last, max(1, round(grown)))
+
+
+def _silhouette(problem: Problem, positions: torch.Tensor, frames: int, seed: int, iteration: int) -> torch.Tensor:
+    """Mean silhouette error of a few pictures drawn from (seed, iteration)."""
+    config, scene = problem.config, problem.scene
+    if config.silhouette_pictures == 0 or config.silhouette_weight == 0:
+        return torch.zeros(())
+    random = np.random.default_rng((seed, iteration))
+    spacing = (problem.volume / problem.count) ** (1 / 3)
+    rotation = torch.as_tensor(problem.axes.rotation, dtype=torch.float32)
+    translation = torch.as_tensor(problem.axes.translation, dtype=torch.float32)
+    errors = []
+    for _ in range(config.silhouette_pictures):
+        frame = int(random.integers(1, frames + 1))
+        view = int(random.choice(scene.views))
+        world = (positions[frame * problem.samples - 1] - translation) @ rotation
+        errors.append(silhouette_error(scene, view, frame, world, spacing))
+    return torch.stack(errors).mean()
+
+
+def _state(iteration, caution, failures, parameters, optimiser, best: Fit) -> dict:
+    return {
+        "iteration": iteration,
+        "caution": caution,
+        "failures": failures,
+        "parameters": [p.detach() for p in parameters],
+        "optimiser": optimiser.state_dict(),
+        "best_law": best.law.state_dict(),
+        "best_motion": list(best.motion.tensors()),
+        "best_error": best.error_m,
+        "history": best.history,
+    }
+
+
+def _restore(state: dict, parameters, optimiser, best: Fit) -> tuple[int, float, int]:
+    with torch.no_grad():
+        for parameter, value in zip(parameters, state["parameters"], strict=True):
+            parameter.copy_(value)
+    optimiser.load_state_dict(state["optimiser"])
+    best.law.load_state_dict(state["best_law"])
+    best.motion = Motion(*state["best_motion"])
+    best.error_m = state["best_error"]
+    best.history = [tuple(row) for row in state["history"]]
+    return state["iteration"], state["caution"], state["failures"]

@@ -1,0 +1,114 @@
+"""What is fixed while parameters are fitted: observed trajectories, the body, the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from masiv.continuum.trajectory import Trajectory
+from masiv.identify.config import IdentifyConfig
+from masiv.materials.law import Law
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.design import grid_spacing, substeps_per_frame
+from masiv.mpm.rollout import rollout
+from masiv.mpm.simulate import thrown
+from masiv.mpm.simulator import Simulator
+from masiv.scene.scene import Scene
+from masiv.scene.transforms import SimulationFrame
+
+STIFFENING = 2.0
+"""A law is given a substep for this multiple of its modulus at rest: it stiffens as it is compressed."""
+
+
+@dataclass
+class Motion:
+    """Parameters of a throw, simulation frame: velocity (3,) [m/s], omega (3,) [rad/s], ground_offset () [m], how far the
+    effective ground lies above the scene's."""
+
+    velocity: torch.Tensor
+    omega: torch.Tensor
+    ground_offset: torch.Tensor
+
+    def tensors(self) -> tuple[torch.Tensor, ...]:
+        return self.velocity, self.omega, self.ground_offset
+
+
+class Problem:
+    """Rollouts of one body against its observed trajectories.
+
+    ``particles`` of the trajectory are used (all where None); targets (F * samples, N, 3) [m] are their positions in the
+    simulation frame at ``samples_per_frame`` instants a frame, the start left out.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        config: IdentifyConfig,
+        simulator: SimulatorConfig,
+        *,
+        particles: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.scene = scene
+        self.config = config
+        self.simulator = simulator
+        self.axes = SimulationFrame.from_scene(scene.up, scene.ground)
+        self.samples = config.samples_per_frame
+        self.frames = len(trajectory.times) - 1
+        instants = np.arange(1, self.frames * self.samples + 1) / (self.samples * scene.fps)
+        points = trajectory.evaluate(np.concatenate([[0.0], instants]))
+        if particles is not None and particles < points.shape[1]:
+            chosen = np.random.default_rng(seed).choice(points.shape[1], particles, replace=False)
+            points = points[:, np.sort(chosen)]
+        moved = torch.as_tensor(self.axes.points_to_simulation(points), dtype=torch.float32)
+        self.start, self.targets = moved[0].contiguous(), moved[1:]
+        self.count = len(self.start)
+        self.volume = trajectory.volume
+        self.spacing = grid_spacing(self.volume, self.count, simulator)
+        self.gravity = self.axes.vectors_to_simulation(scene.gravity)
+        self.size = float((self.start - self.start.mean(0)).norm(dim=1).quantile(0.9)) * 2
+        span = torch.cat([self.start[None], moved])
+        self.speed = float((span[1:] - span[:-1]).norm(dim=2).max()) * self.samples * scene.fps
+
+    def substeps(self, law: Law) -> int:
+        """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number."""
+        count = substeps_per_frame(
+            spacing=self.spacing,
+            wave_modulus=STIFFENING * law.wave_modulus(),
+            density=self.scene.density,
+            speed=self.speed,
+            frame_time=1 / self.scene.fps,
+            config=self.simulator,
+        )
+        unit = 8 * self.samples
+        return -(-count // unit) * unit
+
+    def run(self, law: Law, motion: Motion, contact: str, frames: int) -> torch.Tensor:
+        """Positions (frames * samples, N, 3) [m, simulation frame of the scene], differentiable. Raises NonFiniteError."""
+        steps = self.substeps(law)
+        simulator = Simulator(
+            particle_count=self.count,
+            spacing=self.spacing,
+            substep=1 / (self.scene.fps * steps),
+            volume=self.volume,
+            density=self.scene.density,
+            gravity=self.gravity,
+            contact=contact if self.scene.ground is not None else "none",
+            memory_mb=self.simulator.memory_mb,
+            max_substeps=512,
+            grid_nodes=self.simulator.grid_nodes,
+            chunks=self.simulator.chunks,
+        )
+        # The ground is the plane y = 0 of the simulation: raising it is lowering the body.
+        shift = torch.stack([torch.zeros(()), motion.ground_offset, torch.zeros(())])
+        state = thrown(self.start - shift, motion.velocity, motion.omega)
+        every = steps // self.samples
+        outputs = list(range(every, frames * steps + 1, every))
+        return rollout(simulator, law, state, frames * steps, outputs) + shift
+
+    def error(self, positions: torch.Tensor) -> torch.Tensor:
+        """Mean distance [m] to the observed trajectories, positions (K, N, 3) from the start."""
+        return (positions - self.targets[: len(positions)]).norm(dim=2).mean()

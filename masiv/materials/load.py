@@ -1,0 +1,26 @@
+"""Read any law back from its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+
+from masiv.errors import InputError
+from masiv.materials.classical import ClassicalLaw
+from masiv.materials.law import Law
+from masiv.materials.neural import NeuralLaw
+
+
+def load_law(path: Path) -> Law:
+    """The law in ``path``. Raises InputError where it is missing or is something else."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            state = {name: file.get_tensor(name) for name in file.keys()}
+        kind = metadata["kind"]
+        law = NeuralLaw(width=int(metadata["width"])) if kind == NeuralLaw.kind else ClassicalLaw.from_state(kind, state)
+        law.load_state_dict(state)
+    except (SafetensorError, FileNotFoundError, KeyError, RuntimeError) as error:
+        raise InputError(f"{path} is not a law written by masiv ({error}): run identify or pretrain again") from error
+    return law

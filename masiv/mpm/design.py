@@ -1,0 +1,28 @@
+"""Grid spacing and substep from the object and its law."""
+
+from __future__ import annotations
+
+import math
+
+from masiv.errors import MasivError
+from masiv.mpm.config import SimulatorConfig
+
+
+def grid_spacing(volume: float, particle_count: int, config: SimulatorConfig) -> float:
+    """Cell size [m] at which ``particle_count`` particles fill ``volume`` [m^3] with ``particles_per_cell`` each."""
+    return (config.particles_per_cell * volume / particle_count) ** (1 / 3)
+
+
+def substeps_per_frame(
+    *, spacing: float, wave_modulus: float, density: float, speed: float, frame_time: float, config: SimulatorConfig
+) -> int:
+    """Substeps in a frame such that sound, sqrt(wave_modulus / density), and matter at ``speed`` [m/s] cross at most
+    ``courant_number`` cells in each. Raises MasivError where that is more than the configuration allows."""
+    crossing = math.sqrt(max(wave_modulus, 0.0) / density) + speed
+    count = max(1, math.ceil(frame_time * crossing / (config.courant_number * spacing)))
+    if count > config.max_substeps_per_frame:
+        raise MasivError(
+            f"the law (wave modulus {wave_modulus:.3g} Pa) needs {count} substeps a frame, more than "
+            f"simulator.max_substeps_per_frame = {config.max_substeps_per_frame}: raise it, or use fewer particles"
+        )
+    return count
