@@ -1,0 +1,233 @@
+"""Reconstruction of a small textured ball that falls and is squashed, drawn by the rasteriser's own float64 twin."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from masiv.checkpoint import Checkpoint
+from masiv.errors import InputError, MasivError
+from masiv.progress import silent
+from masiv.scene.camera import Camera
+from masiv.scene.scene import Frame, Scene
+from masiv.splat._reference import _render
+from masiv.splat.config import ReconstructConfig
+from masiv.splat.dynamic import DynamicGaussians
+from masiv.splat.losses import ssim, strain
+from masiv.splat.observe import observe
+from masiv.splat.rasteriser import render
+from masiv.splat.reconstruct import reconstruct
+
+pytestmark = pytest.mark.usefixtures("taichi")
+
+SIDE, FRAMES, FPS = 40, 4, 24.0
+CONFIG = ReconstructConfig(
+    gaussians=250, hull_resolution=20, crop_side=40, crop_padding=4, width=16, depth=1, space_octaves=1, iterations=260
+)
+
+
+def ball(count=400):
+    """Points on a sphere of radius 0.2 m around (0, 0.5, 0), with colours in large patches."""
+    k = np.arange(count) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
+    unit = np.stack([np.cos(turn) * np.sin(polar), np.cos(polar), np.sin(turn) * np.sin(polar)], axis=1)
+    return unit, 0.5 + 0.4 * np.sin(4 * unit + np.array([0.0, 1.0, 2.0]))
+
+
+def truth(unit, frame):
+    """It moves along x and down, faster and faster, and flattens."""
+    squash = np.array([1 + 0.04 * frame, 1 - 0.07 * frame, 1 + 0.04 * frame])
+    return 0.2 * unit * squash + np.array([0.03 * frame, 0.5 - 0.015 * frame**2, 0.0])
+
+
+def camera_at(angle, height):
+    eye = np.array([1.2 * np.sin(angle), height, 1.2 * np.cos(angle)])
+    forward = np.array([0, 0.45, 0]) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 1, 0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
+    return Camera(f"{angle:.1f}", SIDE, SIDE, np.array([[55.0, 0, SIDE / 2], [0, 55.0, SIDE / 2], [0, 0, 1]]), pose)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    cameras = tuple(camera_at(2 * np.pi * k / 7, 0.2 + 0.3 * (k % 4)) for k in range(7))
+    unit, colours = ball()
+    size = torch.full((len(unit),), 0.016, dtype=torch.float64)
+
+    def load(view, frame):
+        points = torch.tensor(truth(unit, frame))
+        rgb, alpha, _ = _render(
+            cameras[view], points, size, 0 * size + 0.95, torch.tensor(colours), torch.full((3,), 0.3).double()
+        )
+        return Frame(
+            (rgb.clamp(0, 1) * 255).round().numpy().astype(np.uint8),
+            (alpha > 0.5).float().numpy(),
+            np.ones((SIDE, SIDE), bool),
+        )
+
+    return Scene(
+        path=Path("ball"),
+        layout="test",
+        fps=FPS,
+        frame_count=FRAMES,
+        cameras=cameras,
+        gravity=np.array([0, -9.8, 0]),
+        up=np.array([0.0, 1.0, 0.0]),
+        ground=None,
+        density=1000.0,
+        load=load,
+        mask_source="test",
+    )
+
+
+@pytest.fixture(scope="module")
+def result(scene, tmp_path_factory):
+    """A run without interruption on six of the seven views."""
+    return reconstruct(
+        scene.restricted(holdout_cameras=(3,)), CONFIG, seed=4, checkpoint=Checkpoint(None), progress=silent
+    )
+
+
+def test_material_points_are_followed(result):
+    unit, _ = ball()
+    start = torch.tensor(truth(unit, 0)).float()
+    for frame in (1, 2, 3):
+        with torch.no_grad():
+            moved = result.deformation(start, frame / FPS)[0].numpy()
+        expected = truth(unit, frame) - truth(unit, 0)
+        error = np.linalg.norm(moved - expected, axis=1).mean()
+        assert error < 0.010 + 0.05 * np.linalg.norm(expected, axis=1).mean(), frame
+        # Better than moving the whole ball: the flattening is seen too.
+        assert frame < 3 or error < 0.8 * np.linalg.norm(expected - expected.mean(axis=0), axis=1).mean()
+
+
+def test_a_view_held_out_is_predicted(scene, result):
+    for frame in (0, 3):
+        picture, camera = scene.frame(3, frame), scene.cameras[3]
+        g = result.at(frame / FPS)
+        drawn = render(camera, g.means, g.scales, g.opacities, g.colours, torch.zeros(3)).rgb.clamp(0, 1).numpy()
+        target = picture.image / 255 * picture.mask[..., None]
+        rows, columns = np.nonzero(picture.mask)
+        box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+        assert -10 * np.log10(((drawn - target)[box] ** 2).mean()) > 20, frame
+
+
+def test_resumed_run_ends_with_the_same_numbers(scene, result, tmp_path):
+    part = scene.restricted(holdout_cameras=(3,))
+    checkpoint = Checkpoint(tmp_path / "state.pt", every_s=0.0)
+
+    def interrupt_at(step):
+        def progress(stage, done, total, note=""):
+            if done >= step:
+                raise KeyboardInterrupt
+
+        return progress
+
+    # In the first frame's share, while frames come in, and after the first pruning with all of them in.
+    for step in (20, 90, 230):
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(part, CONFIG, seed=4, checkpoint=checkpoint, progress=interrupt_at(step))
+        assert checkpoint.load()["iteration"] == step
+    again = reconstruct(part, CONFIG, seed=4, checkpoint=checkpoint, progress=silent)
+    for name in ("means", "scales", "opacities", "colours"):
+        assert torch.equal(getattr(again.canonical, name), getattr(result.canonical, name)), name
+    for name, value in result.deformation.state_dict().items():
+        assert torch.equal(value, again.deformation.state_dict()[name]), name
+
+
+def test_state_of_another_run_is_not_used(scene, tmp_path):
+    short = CONFIG.model_copy(update={"iterations": 3})
+    checkpoint = Checkpoint(tmp_path / "state.pt", every_s=0.0)
+    first = reconstruct(scene, short, seed=1, checkpoint=checkpoint, progress=silent)
+    fresh = reconstruct(scene, short, seed=2, checkpoint=Checkpoint(None), progress=silent)
+    other = reconstruct(scene, short, seed=2, checkpoint=checkpoint, progress=silent)
+    assert torch.equal(fresh.canonical.means, other.canonical.means)
+    assert not torch.equal(first.canonical.means, other.canonical.means)
+
+
+def test_only_what_may_be_seen_is_read(scene):
+    asked = set()
+
+    def load(view, frame):
+        asked.add((view, frame))
+        return scene.load(view, frame)
+
+    part = dataclasses.replace(scene, load=load, _cache={}).restricted(fit_frames=2, holdout_cameras=(0, 5))
+    reconstruct(part, CONFIG.model_copy(update={"iterations": 4}), seed=0, checkpoint=Checkpoint(None), progress=silent)
+    assert asked == {(view, frame) for view in (1, 2, 3, 4, 6) for frame in (0, 1)}
+
+
+def test_a_frame_without_the_object_is_named(scene):
+    def load(view, frame):
+        picture = scene.load(view, frame)
+        return dataclasses.replace(picture, mask=picture.mask * (frame != 2))
+
+    empty = dataclasses.replace(scene, load=load, _cache={})
+    with pytest.raises(MasivError, match=r"frame 2 of ball"):
+        reconstruct(empty, CONFIG, seed=0, checkpoint=Checkpoint(None), progress=silent)
+
+
+def test_result_round_trip(result, tmp_path):
+    result.save(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["deformation.safetensors", "gaussians.ply"]
+    again = DynamicGaussians.load(tmp_path)
+    torch.testing.assert_close(again.at(0.1).means, result.at(0.1).means, atol=1e-6, rtol=0)
+    torch.testing.assert_close(again.at(0.1).scales, result.at(0.1).scales, rtol=1e-4, atol=0)
+    (tmp_path / "deformation.safetensors").unlink()
+    with pytest.raises(InputError, match=r"deformation\.safetensors"):
+        DynamicGaussians.load(tmp_path)
+
+
+def test_averaged_crop_shows_the_same_points(scene):
+    """Halving the picture halves the pixel coordinates, counted from the crop's corner."""
+    whole = observe(scene, 1, 0, crop_side=40, crop_padding=3)
+    half = observe(scene, 1, 0, crop_side=16, crop_padding=3)
+    assert whole.colour.shape[:2] == (whole.camera.height, whole.camera.width)
+    assert half.camera.width < whole.camera.width
+    points = truth(ball(5)[0], 0)
+    rays = [
+        np.linalg.solve(o.camera.intrinsics, np.c_[o.camera.project(points)[0], np.ones(5)].T) for o in (whole, half)
+    ]
+    np.testing.assert_allclose(rays[0], rays[1], atol=1e-12)
+    # The centre of mass of the mask is the same point of the scene in both.
+    centres = []
+    for o in (whole, half):
+        rows, columns = np.mgrid[: o.camera.height, : o.camera.width] + 0.5
+        weight = o.mask.numpy() / o.mask.numpy().sum()
+        centres.append(np.linalg.solve(o.camera.intrinsics, [(columns * weight).sum(), (rows * weight).sum(), 1]))
+    np.testing.assert_allclose(centres[0], centres[1], atol=2e-3)
+
+
+def test_occluded_pixels_neither_count_nor_darken(scene):
+    def load(view, frame):
+        picture = scene.load(view, frame)
+        valid = picture.valid.copy()
+        valid[:, ::2] = False
+        image = np.where(valid[..., None], picture.image, 0).astype(np.uint8)
+        return Frame(image, picture.mask, valid)
+
+    hidden = observe(dataclasses.replace(scene, load=load, _cache={}), 1, 0, crop_side=16, crop_padding=3)
+    open_ = observe(scene, 1, 0, crop_side=16, crop_padding=3)
+    inside = (open_.mask > 0.999) & (hidden.valid > 0)
+    assert hidden.valid.max() < 0.8
+    assert (hidden.colour - open_.colour)[inside].abs().mean() < 0.05
+
+
+def test_ssim_and_strain_have_their_known_values():
+    picture = torch.rand(20, 24, 3, generator=torch.Generator().manual_seed(0)).double()
+    assert float(ssim(picture, picture)) == pytest.approx(1.0, abs=1e-12)
+    flat = torch.full((20, 24, 3), 0.4).double()
+    luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
+    assert float(ssim(flat, flat + 0.2)) == pytest.approx(luminance, rel=1e-6)
+
+    rest = torch.randn(30, 3, generator=torch.Generator().manual_seed(1)).double()
+    pairs = torch.arange(0, 29), torch.arange(1, 30)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, 1.0, 0.2], [-1, 0, 0.5], [-0.2, -0.5, 0]]).double())
+    assert float(strain(rest, rest @ turn.T + 3 - rest, *pairs, softening=0.0)) < 1e-10
+    assert float(strain(rest, 0.1 * rest, *pairs, softening=0.0)) == pytest.approx(0.01, rel=1e-6)
