@@ -158,6 +158,7 @@ def test_agreement_is_a_root_mean_square_without_frame_0():
 def test_table_has_a_row_a_block():
     numbers = {
         "schema": 1,
+        "units": {"psnr_db": "dB"},
         "reconstruction": {
             "training_views": {"frames": [0, 1, 2, 5], "views": [0], "psnr_db": 20.0},
             "held_out_views": None,

@@ -129,7 +129,7 @@ COLUMNS = {
 
 def blocks(numbers: Mapping[str, Any], name: str = "") -> list[tuple[str, Mapping[str, Any]]]:
     """The nested blocks that hold measured numbers, with their names in words."""
-    if any(column in numbers for column in COLUMNS):
+    if "frames" in numbers and any(column in numbers for column in COLUMNS):
         return [(name, numbers)]
     found = []
     for key, value in numbers.items():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from masiv.metrics import mask_box
 from masiv.report import plots
 from masiv.report.draw import draw, on_black
 from masiv.report.film import joined
@@ -90,19 +91,28 @@ def shown_views(run: RunFolder, scene: Scene) -> list[int]:
 def comparison_frames(
     run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout: np.ndarray, view: int, height: int = 360
 ) -> list[np.ndarray]:
-    """Observed | reconstruction | twin, one picture a frame, ``height`` pixels high. Grey where there is none."""
+    """Observed | reconstruction | twin, one picture a frame, ``height`` pixels high, cut to where the object ever is.
+
+    Grey where there is none.
+    """
     camera = scene.cameras[view]
     binding = Binding.at_rest(dynamic.at(0.0), rollout[0])
-    pictures = []
+    triples = []
+    ever = np.zeros((camera.height, camera.width), np.float32)
     for frame in range(scene.frame_count):
         observed = scene.frame(view, frame)
         seen = on_black(observed.image, observed.mask)
         made = np.full_like(seen, GREY)
         if frame < run.fit_frames:
             made, _ = draw(dynamic.at(frame / scene.fps), camera)
-        simulated, _ = draw(binding.moved(rollout[frame]), camera)
-        gap = np.full((seen.shape[0], 2, 3), 255, np.uint8)
-        row = joined([seen, gap, made, gap, simulated])
+        simulated, alpha = draw(binding.moved(rollout[frame]), camera)
+        ever = np.maximum(ever, np.maximum(observed.mask, alpha))
+        triples.append((seen, made, simulated))
+    box = mask_box(ever, margin=6) or (slice(None), slice(None))
+    pictures = []
+    for seen, made, simulated in triples:
+        gap = np.full((seen[box].shape[0], 2, 3), 255, np.uint8)
+        row = joined([seen[box], gap, made[box], gap, simulated[box]])
         width = round(row.shape[1] * height / row.shape[0])
         enlarge = cv2.INTER_LANCZOS4 if height > row.shape[0] else cv2.INTER_AREA
         pictures.append(cv2.resize(row, (width, height), interpolation=enlarge))
