@@ -1,0 +1,86 @@
+"""What a synthetic scene is made of. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from masiv.errors import InputError
+from masiv.strict import read_yaml, validated
+
+Vector = tuple[float, float, float]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ShapeSpec(_Part):
+    """The body at frame 0. Its bounding box is as long as ``size`` before it is turned; it floats over the ground."""
+
+    kind: Literal["cube", "sphere", "capsule", "cylinder", "torus", "cross", "mesh"] = "cube"
+    mesh: Path | None = Field(None, description="a watertight triangle mesh, for kind mesh; relative to the spec")
+    size: float = Field(0.5, gt=0, description="longest side [m]")
+    rotation_deg: Vector = Field((0, 0, 0), description="about the fixed axes x, then y, then z")
+    position: tuple[float, float] = Field((0, 0), description="x, z of the box's centre [m]")
+    clearance: float = Field(0.15, ge=0, description="lowest point above the ground [m]")
+
+    @model_validator(mode="after")
+    def _mesh_is_given(self) -> ShapeSpec:
+        if (self.kind == "mesh") != (self.mesh is not None):
+            raise ValueError("kind mesh and the key mesh go together")
+        return self
+
+
+class MaterialSpec(_Part):
+    """A classical law of masiv.materials with its parameters, in SI units (angles in degrees)."""
+
+    law: str = "neo_hookean"
+    parameters: dict[str, float] = {"youngs_modulus": 4e4, "poissons_ratio": 0.3}
+    density: float = Field(1000.0, gt=0, description="[kg/m^3]")
+
+
+class CameraSpec(_Part):
+    """Cameras evenly round the body, at heights that alternate."""
+
+    count: int = Field(11, ge=2, le=200)
+    size: int = Field(128, ge=16, le=2048, description="side of the square pictures [pixels]")
+    distance: float = Field(2.4, gt=0, description="to the vertical axis through the target [m]")
+    heights: tuple[float, ...] = Field((0.5, 1.1, 1.9), min_length=1, description="taken in turn [m]")
+    target: Vector = Field((0, 0.3, 0), description="all cameras look at it [m]")
+    field_of_view_deg: float = Field(36.0, gt=1, lt=150)
+
+
+class SynthSpec(_Part):
+    """A synthetic multi-view scene: y up, ground at y = 0."""
+
+    shape: ShapeSpec = ShapeSpec()
+    material: MaterialSpec = MaterialSpec()
+    velocity: Vector = Field((0, 0, 0), description="of the centre at frame 0 [m/s]")
+    omega: Vector = Field((0, 0, 0), description="spin at frame 0 [rad/s]")
+    gravity: Vector = Field((0, -9.8, 0), description="[m/s^2]")
+    contact: Literal["sticky", "release", "slip"] = "sticky"
+    friction: float = Field(0.0, ge=0, description="Coulomb's coefficient of contact slip")
+    frames: int = Field(12, ge=2)
+    fps: float = Field(24.0, gt=0)
+    cameras: CameraSpec = CameraSpec()
+    texture: Literal["noise", "stripes", "patches"] = "noise"
+    image_noise: float = Field(1.5, ge=0, description="standard deviation, of 255")
+    supersampling: Annotated[int, Field(ge=1, le=8)] = 3
+    particles: int = Field(20000, ge=100, description="in the simulation")
+    truth_particles: int = Field(4096, ge=1, description="of them in gt/")
+    seed: int = Field(0, ge=0)
+
+
+def read_spec(path: Path) -> SynthSpec:
+    """The spec in a YAML file. Raises InputError, naming the nearest known key, where something is wrong with it."""
+    spec = validated(SynthSpec, read_yaml(path), str(path))
+    mesh = spec.shape.mesh
+    if mesh is None:
+        return spec
+    located = mesh if mesh.is_absolute() else path.parent / mesh
+    if not located.is_file():
+        raise InputError(f"{path}: shape.mesh {located} does not exist")
+    return spec.model_copy(update={"shape": spec.shape.model_copy(update={"mesh": located})})

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from ring_scene import look_at, pixel_rays
+
+from masiv.errors import InputError
+from masiv.scene.read import read_scene
+from masiv.synth.motion import Skin
+from masiv.synth.picture import rasterise
+from masiv.synth.shapes import make_body
+from masiv.synth.spec import ShapeSpec, SynthSpec, read_spec
+from masiv.synth.synthesise import synthesise
+
+SMALL = {
+    "shape": {"kind": "sphere", "size": 0.4, "clearance": 0.3},
+    "velocity": [0.5, 0.2, 0.0],
+    "omega": [0.0, 3.0, 0.0],
+    "frames": 3,
+    "cameras": {"count": 3, "size": 48},
+    "particles": 600,
+    "truth_particles": 200,
+    "supersampling": 2,
+}
+
+
+@pytest.fixture(scope="module")
+def scene_folder(taichi, tmp_path_factory):
+    out = tmp_path_factory.mktemp("synth") / "scene"
+    synthesise(SynthSpec.model_validate(SMALL), out)
+    return out
+
+
+def test_scene_is_read_as_it_was_made(scene_folder):
+    scene = read_scene(scene_folder)
+    assert (scene.layout, scene.frame_count, len(scene.cameras), scene.fps) == ("pacnerf", 3, 3, pytest.approx(24.0))
+    assert not scene.problems
+    truth = yaml.safe_load((scene_folder / "truth.yaml").read_text())
+    assert truth["material"]["law"] == "neo_hookean"
+    assert len(json.loads((scene_folder / "all_data.json").read_text())) == 3 * 4
+
+
+def test_particles_project_onto_the_masks(scene_folder):
+    scene = read_scene(scene_folder)
+    for frame in (0, 2):
+        points = np.load(scene_folder / "gt" / f"particles_{frame}.npy")
+        for view in scene.views:
+            mask = scene.frame(view, frame).mask > 0.5
+            pixels, _ = scene.cameras[view].project(points.astype(float))
+            column, row = np.floor(pixels).astype(int).T
+            assert mask[row, column].mean() > 0.98
+            # and they fill it: the silhouette is no larger than the ball
+            covered = np.zeros_like(mask)
+            covered[row, column] = True
+            covered = cv2.dilate(covered.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+            assert (mask & covered).sum() > 0.95 * mask.sum()
+
+
+def test_free_fall_of_the_truth(scene_folder):
+    """Before contact the centre follows v t + g t^2 / 2, and the ball keeps its spin."""
+    points = [np.load(scene_folder / "gt" / f"particles_{frame}.npy").astype(float) for frame in range(3)]
+    for frame, t in ((1, 1 / 24), (2, 2 / 24)):
+        moved = points[frame].mean(0) - points[0].mean(0)
+        np.testing.assert_allclose(moved, [0.5 * t, 0.2 * t - 4.9 * t * t, 0], atol=2.5e-3)
+        a, b = points[0] - points[0].mean(0), points[frame] - points[frame].mean(0)
+        turn = np.arctan2((a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]).sum(), (a[:, [0, 2]] * b[:, [0, 2]]).sum())
+        assert turn == pytest.approx(3.0 * t, rel=0.1)
+
+
+def test_same_seed_same_files_and_no_overwriting(scene_folder, tmp_path):
+    again = tmp_path / "again"
+    synthesise(SynthSpec.model_validate(SMALL), again)
+    for path in scene_folder.rglob("*"):
+        if path.is_file():
+            assert (again / path.relative_to(scene_folder)).read_bytes() == path.read_bytes(), path.name
+    with pytest.raises(InputError, match="new folder"):
+        synthesise(SynthSpec.model_validate(SMALL), again)
+    assert [path.name for path in tmp_path.iterdir()] == ["again"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "volume"),
+    [("cube", 1.0), ("sphere", np.pi / 6), ("cylinder", np.pi * 0.4**2), ("cross", 0.36**3 + 6 * 0.32 * 0.36**2)],
+)
+def test_volume_of_shapes(kind, volume):
+    body = make_body(ShapeSpec(kind=kind, size=0.5, clearance=0.2), 8000)
+    assert body.volume == pytest.approx(volume * 0.125, rel=0.03)
+    assert len(body.particles) == pytest.approx(8000, rel=0.15)
+    assert body.vertices[:, 1].min() == pytest.approx(0.2)
+    assert np.ptp(body.vertices, axis=0).max() == pytest.approx(0.5)
+    # every particle is within the hull of the surface
+    assert (body.particles.min(0) > body.vertices.min(0)).all()
+    assert (body.particles.max(0) < body.vertices.max(0)).all()
+
+
+def test_mesh_is_used_and_must_be_closed(tmp_path):
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    mesh.export(tmp_path / "ball.obj")
+    body = make_body(ShapeSpec(kind="mesh", mesh=tmp_path / "ball.obj", size=0.5), 3000)
+    assert body.volume == pytest.approx(mesh.volume / 8 * 0.125, rel=0.08)
+    mesh.update_faces(np.arange(len(mesh.faces)) > 3)
+    mesh.export(tmp_path / "open.obj")
+    with pytest.raises(InputError, match="watertight"):
+        make_body(ShapeSpec(kind="mesh", mesh=tmp_path / "open.obj", size=0.5), 1000)
+
+
+def test_spec_names_the_nearest_key_and_finds_its_mesh(tmp_path):
+    path = tmp_path / "spec.yaml"
+    path.write_text("shape: {kind: cube, sise: 0.4}\n")
+    with pytest.raises(InputError, match=r"shape\.size"):
+        read_spec(path)
+    path.write_text("shape: {kind: mesh, mesh: absent.obj}\n")
+    with pytest.raises(InputError, match=r"absent\.obj"):
+        read_spec(path)
+
+
+def test_skin_follows_any_affine_motion_exactly():
+    rng = np.random.default_rng(0)
+    particles, vertices = rng.uniform(-1, 1, (500, 3)), rng.uniform(-1.05, 1.05, (80, 3))
+    skin = Skin(vertices, particles)
+    np.testing.assert_allclose(skin.at(particles), vertices, atol=1e-12)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    np.testing.assert_allclose(skin.at(particles @ turn.T + 2.0), vertices @ turn.T + 2.0, atol=0.02)
+
+
+def test_rasteriser_against_ray_casting():
+    """Two crossing triangles, seen at an angle: same face and point as Moeller and Trumbore find."""
+    vertices = np.array(
+        [[-0.6, 0, 0.1], [0.6, 0.1, -0.2], [0, 0.9, 0.3], [-0.5, 0.3, -0.5], [0.1, 0.8, 0.5], [0.6, 0.2, 0.4]]
+    )
+    faces = np.array([[0, 1, 2], [3, 4, 5], [2, 1, 0], [5, 4, 3]])
+    camera = look_at("0", np.array([0.8, 0.9, 2.2]), np.array([0, 0.4, 0]), 60, 80.0)
+    face, barycentric = rasterise(camera, vertices, faces)
+    rays = pixel_rays(camera).reshape(-1, 3)
+    best = np.full(len(rays), np.inf)
+    for a, b, c in vertices[faces[:2]]:
+        solution = np.linalg.solve(
+            np.stack([np.broadcast_to(b - a, rays.shape), np.broadcast_to(c - a, rays.shape), -rays], axis=-1),
+            np.broadcast_to((camera.centre - a)[None, :, None], (len(rays), 3, 1)),
+        )[..., 0]
+        u, v, t = solution.T
+        best = np.minimum(best, np.where((u >= 0) & (v >= 0) & (u + v <= 1), t, np.inf))
+    hit = (face >= 0).ravel()
+    assert (hit == np.isfinite(best)).mean() > 0.999
+    assert hit.sum() > 300
+    points = np.einsum("pk,pki->pi", barycentric.reshape(-1, 3)[hit], vertices[faces[face.ravel()[hit]]])
+    distance = np.linalg.norm(points - camera.centre, axis=1)
+    both = np.isfinite(best[hit])
+    np.testing.assert_allclose(distance[both], best[hit][both], atol=1e-6)
