@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 from typing import Any
 
@@ -27,7 +29,8 @@ def start(arch: str = "cpu") -> Any:
     known = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
     if arch not in known:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
-    ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, where stdout may be for one JSON object
+        ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0)
     running = ti.lang.impl.current_cfg().arch
     if arch != "cpu" and running != known[arch]:
         ti.reset()

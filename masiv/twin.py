@@ -25,9 +25,10 @@ SCHEMA = 1
 class Twin:
     """Geometry, initial motion, law and surroundings of one object. World frame, SI units.
 
-    positions (Q, 3) float32 [m] at frame 0; velocity (3,) [m/s] of the centroid and omega (3,) [rad/s] about it; gravity (3,)
-    [m/s^2]; ground: the effective plane (None: no ground); contact, friction: see ``masiv.mpm.simulator.Simulator``;
-    volume [m^3]; density [kg/m^3]; up (3,); fps: of the video it came from. fit: how the law was found (numbers with units).
+    positions (Q, 3) float32 [m] at frame 0; velocity (3,) [m/s] of the centroid and omega (3,) [rad/s] about it;
+    gravity (3,) [m/s^2]; ground: the effective plane (None: no ground); contact, friction: see
+    ``masiv.mpm.simulator.Simulator``; volume [m^3]; density [kg/m^3]; up (3,); fps: of the video it came from. fit: how
+    the law was found (numbers with units).
     """
 
     positions: np.ndarray

@@ -88,7 +88,9 @@ def test_bar_rings_at_its_natural_frequency():
 
 
 @pytest.mark.parametrize("contact", ["sticky", "release", "slip"])
-@pytest.mark.parametrize("law", [elastic(), NeuralLaw(stress_scale=5e3, seed=3).double()], ids=["neo_hookean", "neural"])
+@pytest.mark.parametrize(
+    "law", [elastic(), NeuralLaw(stress_scale=5e3, seed=3).double()], ids=["neo_hookean", "neural"]
+)
 def test_substeps_and_gradients_equal_the_twin(law, contact):
     steps = 4
     sim = simulator(40, contact=contact)

@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class IdentifyConfig(BaseModel):
-    """Initial velocity, ground and law. Lengths in metres; weights multiply mean errors in units of the object's size."""
+    """Initial velocity, ground and law. Lengths in metres; weights multiply mean errors in units of the object's
+    size."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from dataclasses import dataclass, field
 
@@ -43,8 +44,8 @@ def fit(
 ) -> Fit:
     """Adam on a horizon that grows from ``first_frames`` to all frames over the first half of the iterations.
 
-    A rollout that diverges is not repaired: the step is taken back and the step sizes are halved; after several in a row the
-    stage stops. Returns the parameters with the least error over all frames. Raises MasivError.
+    A rollout that diverges is not repaired: the step is taken back and the step sizes are halved; after several in a
+    row the stage stops. Returns the parameters with the least error over all frames. Raises MasivError.
     """
     config = problem.config
     law = copy.deepcopy(law)
@@ -66,7 +67,8 @@ def fit(
         first, caution, failures = _restore(saved["fit"], parameters, optimiser, best)
     accepted = [p.detach().clone() for p in parameters]
     for i in range(first, config.iterations):
-        checkpoint.maybe_save(lambda i=i: {"fit": _state(i, caution, failures, parameters, optimiser, best)})
+        state = functools.partial(_state, i, caution, failures, parameters, optimiser, best)
+        checkpoint.maybe_save(lambda state=state: {"fit": state()})
         frames = _horizon(i, config.iterations, first_frames, problem.frames)
         decay = 0.5 * (1 + math.cos(math.pi * i / config.iterations))
         for group in optimiser.param_groups:

@@ -24,8 +24,8 @@ def estimate_launch(
 ) -> Launch:
     """Least squares on free flight, x(t) = c + v t + g t^2 / 2 + exp([omega] t) (x0 - c).
 
-    positions (T, N, 3) [m] at times (T,) [s]. Flight ends before the first frame whose lowest hundredth of particles is within
-    ``clearance`` [m] of the ground; where that is at once, frames 0 and 1 have to do.
+    positions (T, N, 3) [m] at times (T,) [s]. Flight ends before the first frame whose lowest hundredth of particles is
+    within ``clearance`` [m] of the ground; where that is at once, frames 0 and 1 have to do.
     """
     last = len(times) - 1
     if ground is not None:
@@ -35,7 +35,8 @@ def estimate_launch(
             last = max(1, int(touching[0]))
     t = times[1 : last + 1]
     centres = positions[: last + 1].mean(1)
-    # Fall is known, so that what is left is linear in time; late frames tell more of a velocity: least squares through 0.
+    # Fall is known, so that what is left is linear in time; late frames tell more of a velocity: least squares through
+    # 0.
     drift = centres[1:] - centres[0] - 0.5 * gravity * t[:, None] ** 2
     velocity = (t[:, None] * drift).sum(0) / (t**2).sum()
     arms = positions[0] - centres[0]

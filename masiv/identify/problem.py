@@ -24,8 +24,8 @@ STIFFENING = 2.0
 
 @dataclass
 class Motion:
-    """Parameters of a throw, simulation frame: velocity (3,) [m/s], omega (3,) [rad/s], ground_offset () [m], how far the
-    effective ground lies above the scene's."""
+    """Parameters of a throw, simulation frame: velocity (3,) [m/s], omega (3,) [rad/s], ground_offset () [m], how far
+    the effective ground lies above the scene's."""
 
     velocity: torch.Tensor
     omega: torch.Tensor
@@ -38,8 +38,8 @@ class Motion:
 class Problem:
     """Rollouts of one body against its observed trajectories.
 
-    ``particles`` of the trajectory are used (all where None); targets (F * samples, N, 3) [m] are their positions in the
-    simulation frame at ``samples_per_frame`` instants a frame, the start left out.
+    ``particles`` of the trajectory are used (all where None); targets (F * samples, N, 3) [m] are their positions in
+    the simulation frame at ``samples_per_frame`` instants a frame, the start left out.
     """
 
     def __init__(
@@ -87,7 +87,8 @@ class Problem:
         return -(-count // unit) * unit
 
     def run(self, law: Law, motion: Motion, contact: str, frames: int) -> torch.Tensor:
-        """Positions (frames * samples, N, 3) [m, simulation frame of the scene], differentiable. Raises NonFiniteError."""
+        """Positions (frames * samples, N, 3) [m, simulation frame of the scene], differentiable. Raises
+        NonFiniteError."""
         steps = self.substeps(law)
         simulator = Simulator(
             particle_count=self.count,

@@ -1,4 +1,5 @@
-"""Where the fit starts: the pretrained law, contact, stiffness and yield strain whose rollout is nearest to the motion."""
+"""Where the fit starts: the pretrained law, contact, stiffness and yield strain whose rollout is nearest to the
+motion."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ from masiv.materials.pretrain import MATERIALS, pretrained_path
 from masiv.progress import Progress
 
 MODULI = (3e3, 1e4, 3e4, 1e5, 3e5)
-"""P-wave moduli tried [Pa at 1000 kg/m^3]: waves of 1.7 to 17 m/s, from what sags at once to what hardly deforms in a throw."""
+"""P-wave moduli tried [Pa at 1000 kg/m^3]: waves of 1.7 to 17 m/s, from what sags at once to what hardly deforms in a
+throw."""
 DIVERGED = 1e3
 
 

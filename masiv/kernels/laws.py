@@ -9,8 +9,8 @@ from masiv.kernels import tensor
 class ClassicalKernels:
     """A law that maps (trial gradient, coefficients) to (elastic gradient, stress) in one pointwise function.
 
-    The adjoint is Taichi's, on fields of one substep, so that only those carry gradients. Coefficients are per particle: no
-    two particles add to the same gradient, and no float atomic is needed.
+    The adjoint is Taichi's, on fields of one substep, so that only those carry gradients. Coefficients are per
+    particle: no two particles add to the same gradient, and no float atomic is needed.
     """
 
     def __init__(self, mpm, kind: str, coefficients: int):
@@ -37,7 +37,6 @@ class ClassicalKernels:
         for p in range(out.shape[0]):
             for c in ti.static(range(self.n_coefficients)):
                 out[p, c] = self.coefficients.grad[p][c]
-
 
     @ti.kernel
     def forward(self, s: ti.i32, count: ti.i32):
@@ -76,8 +75,8 @@ class ClassicalKernels:
 class NeuralKernels:
     """A law whose coefficients are functions of the strain invariants, evaluated in torch between two kernels.
 
-    share (N, 2) are the coefficients of ``tensor.neural_flow``, moduli (N, 4) those of ``tensor.neural_stress``. The adjoints
-    are by hand: Taichi's autodiff takes a minute to compile the inverses.
+    share (N, 2) are the coefficients of ``tensor.neural_flow``, moduli (N, 4) those of ``tensor.neural_stress``. The
+    adjoints are by hand: Taichi's autodiff takes a minute to compile the inverses.
     """
 
     def __init__(self, mpm):

@@ -7,12 +7,12 @@ Forward (Hu et al. 2018, "A moving least squares material point method"):
     g2p   v_p = sum w v_i,  C_p = 4/dx^2 sum w v_i d^T,  x_p += dt v_p,  F_trial = (I + dt C_p) F
 
 The adjoint of P2G is a gather and the adjoint of G2P a scatter, so both directions share two loop shapes. On a CPU each
-chunk of particles scatters into a grid of its own (a float atomic is a compare-and-swap loop there, and its order is not
-reproducible); on a GPU all particles scatter atomically into one grid.
+chunk of particles scatters into a grid of its own (a float atomic is a compare-and-swap loop there, and its order is
+not reproducible); on a GPU all particles scatter atomically into one grid.
 
 The grid is a window that follows the particles: node (i, j, k) of the lattice dx Z^3 lives at a flat index relative to
-``window_origin``, so the domain is unbounded and memory is that of the object. State fields are allocated by capacity, and
-live counts are kernel arguments: a field's shape is part of a compiled kernel.
+``window_origin``, so the domain is unbounded and memory is that of the object. State fields are allocated by capacity,
+and live counts are kernel arguments: a field's shape is part of a compiled kernel.
 """
 
 import taichi as ti
@@ -278,9 +278,7 @@ class MpmKernels:
                 value = weight * push
                 self.add(t, node, ti.Vector([value[0], value[1], value[2], 0.0]))
                 along = vi.dot(push)
-                x_bar += along * ti.Vector(
-                    [gx * w[j, 1] * w[k, 2], wx * g[j, 1] * w[k, 2], wx * w[j, 1] * g[k, 2]]
-                )
+                x_bar += along * ti.Vector([gx * w[j, 1] * w[k, 2], wx * g[j, 1] * w[k, 2], wx * w[j, 1] * g[k, 2]])
                 v_sum += weight * vi
         self.position_bar[p] += (x_bar - slope.transpose() @ v_sum) / dx
 
@@ -354,9 +352,7 @@ class MpmKernels:
                     push = ti.Vector([bar[0], bar[1], bar[2]])
                     momentum = corner + dx * (affine @ ti.Vector([i, j, k]))
                     along = momentum.dot(push) + mass * bar[3]
-                    x_bar += along * ti.Vector(
-                        [gx * w[j, 1] * w[k, 2], wx * g[j, 1] * w[k, 2], wx * w[j, 1] * g[k, 2]]
-                    )
+                    x_bar += along * ti.Vector([gx * w[j, 1] * w[k, 2], wx * g[j, 1] * w[k, 2], wx * w[j, 1] * g[k, 2]])
                     wp = (wx * w[j, 1] * w[k, 2]) * push
                     v_bar += wp
                     for a in ti.static(range(3)):

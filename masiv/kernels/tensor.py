@@ -1,5 +1,5 @@
-"""Tensor algebra of constitutive laws as Taichi functions, without a singular value decomposition where a gradient is needed:
-the derivative of sorted singular values is undefined at F = I, where every rollout starts."""
+"""Tensor algebra of constitutive laws as Taichi functions, without a singular value decomposition where a gradient is
+needed: the derivative of sorted singular values is undefined at F = I, where every rollout starts."""
 
 import taichi as ti
 
@@ -132,7 +132,11 @@ def hencky(u, strain, v, mu, lam):
     principal = 2.0 * mu * strain + lam * strain.sum()
     zero = 0.0 * stretch[0]
     f = u @ ti.Matrix([[stretch[0], zero, zero], [zero, stretch[1], zero], [zero, zero, stretch[2]]]) @ v.transpose()
-    tau = u @ ti.Matrix([[principal[0], zero, zero], [zero, principal[1], zero], [zero, zero, principal[2]]]) @ u.transpose()
+    tau = (
+        u
+        @ ti.Matrix([[principal[0], zero, zero], [zero, principal[1], zero], [zero, zero, principal[2]]])
+        @ u.transpose()
+    )
     return f, tau
 
 
@@ -144,7 +148,8 @@ def principal_strain(f):
 
 @ti.func
 def von_mises(f, c):
-    """c = (mu, lambda, yield stress) [Pa]. Hencky elasticity, return to |dev eps| = yield / (2 mu) (PAC-NeRF, plasticine)."""
+    """c = (mu, lambda, yield stress) [Pa]. Hencky elasticity, return to |dev eps| = yield / (2 mu) (PAC-NeRF,
+    plasticine)."""
     u, strain, v = principal_strain(f)
     mean = strain.sum() / 3.0
     dev = strain - mean

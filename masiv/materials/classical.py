@@ -41,14 +41,19 @@ class ClassicalLaw(Law):
         if kind not in PARAMETERS:
             raise InputError(f"unknown classical law '{kind}': use one of {', '.join(PARAMETERS)}")
         if set(parameters) != set(PARAMETERS[kind]):
-            raise InputError(f"law {kind} needs exactly {', '.join(PARAMETERS[kind])}, got {', '.join(parameters) or 'none'}")
+            raise InputError(
+                f"law {kind} needs exactly {', '.join(PARAMETERS[kind])}, got {', '.join(parameters) or 'none'}"
+            )
         if not (parameters["youngs_modulus"] > 0 and -1 < parameters["poissons_ratio"] < 0.5):
             raise InputError(f"law {kind}: youngs_modulus must be > 0 and poissons_ratio within (-1, 0.5)")
         if parameters.get("yield_stress", 1.0) <= 0 or not 0 < parameters.get("friction_angle", 1.0) < 90:
             raise InputError(f"law {kind}: yield_stress must be > 0 Pa and friction_angle within (0, 90) degrees")
         self.kind = kind
         self.values = torch.nn.ParameterDict(
-            {name: torch.nn.Parameter(torch.tensor(float(parameters[name]), dtype=torch.float64)) for name in PARAMETERS[kind]}
+            {
+                name: torch.nn.Parameter(torch.tensor(float(parameters[name]), dtype=torch.float64))
+                for name in PARAMETERS[kind]
+            }
         )
 
     @classmethod

@@ -31,8 +31,8 @@ class BoundLaw(ABC):
 class Law(torch.nn.Module, ABC):
     """Elastic stress and plastic flow of a material.
 
-    ``project`` and ``stress`` are pointwise and differentiable torch functions: the definition of the law, in any dtype.
-    ``bind`` gives the fast equivalent on the fields of a simulator.
+    ``project`` and ``stress`` are pointwise and differentiable torch functions: the definition of the law, in any
+    dtype. ``bind`` gives the fast equivalent on the fields of a simulator.
     """
 
     kind: str

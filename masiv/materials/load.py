@@ -19,7 +19,9 @@ def load_law(path: Path) -> Law:
             metadata = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}
         kind = metadata["kind"]
-        law = NeuralLaw(width=int(metadata["width"])) if kind == NeuralLaw.kind else ClassicalLaw.from_state(kind, state)
+        law = (
+            NeuralLaw(width=int(metadata["width"])) if kind == NeuralLaw.kind else ClassicalLaw.from_state(kind, state)
+        )
         law.load_state_dict(state)
     except (SafetensorError, FileNotFoundError, KeyError, RuntimeError) as error:
         raise InputError(f"{path} is not a law written by masiv ({error}): run identify or pretrain again") from error

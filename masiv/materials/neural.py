@@ -1,13 +1,13 @@
 """The neural constitutive law: isotropic, frame indifferent, at rest at F = I, whatever its weights are.
 
-Stress is a combination of the isotropic tensor basis of the left Cauchy-Green tensor, flow a relaxation of the elastic strain
-at a rate; two small networks give the coefficients from three invariants of the strain. With positive moduli the principal
-stresses are ordered as the principal stretches are (the Baker-Ericksen inequalities) and pressure opposes compression. The
-flow is a rate, so the law does not depend on the substep: elastic bodies, viscous fluids, plasticity and sand are relaxation
-times that depend on strain in different ways.
+Stress is a combination of the isotropic tensor basis of the left Cauchy-Green tensor, flow a relaxation of the elastic
+strain at a rate; two small networks give the coefficients from three invariants of the strain. With positive moduli the
+principal stresses are ordered as the principal stretches are (the Baker-Ericksen inequalities) and pressure opposes
+compression. The flow is a rate, so the law does not depend on the substep: elastic bodies, viscous fluids, plasticity
+and sand are relaxation times that depend on strain in different ways.
 
-differs from MASIV and NCLaw: their networks see F^T F entry by entry (frame indifferent but not isotropic) and correct F
-once a substep, which ties the law to the substep.
+differs from MASIV and NCLaw: their networks see F^T F entry by entry (frame indifferent but not isotropic) and correct
+F once a substep, which ties the law to the substep.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ def strain_invariants(deformation_gradient: torch.Tensor) -> torch.Tensor:
 class NeuralLaw(Law):
     """Two networks 3 -> width -> width -> coefficients, and two scales learnt as logarithms.
 
-    The elastic network gives log moduli relative to the stress scale [Pa], the plastic one log relaxation rates [1/s] of
-    strains relative to the flow strain: moving the two scales makes another stiffness and another yield strain of one kind.
+    The elastic network gives log moduli relative to the stress scale [Pa], the plastic one log relaxation rates [1/s]
+    of strains relative to the flow strain: moving the two scales makes another stiffness and another yield strain of
+    one kind.
     """
 
     kind = "neural"

@@ -1,7 +1,8 @@
 """Initial laws: a neural law taught from the full state of one simulated throw of a classical material (as NCLaw does).
 
-Two phases. The pointwise states of the throw (trial gradient, elastic gradient, stress) are fitted first; then the law is
-rolled out from true states, in segments that grow, and the positions are compared (teacher forcing, Ma et al. 2023, section 4).
+Two phases. The pointwise states of the throw (trial gradient, elastic gradient, stress) are fitted first; then the law
+is rolled out from true states, in segments that grow, and the positions are compared (teacher forcing, Ma et al. 2023,
+section 4).
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulator import Simulator, State
 from masiv.progress import Progress, silent
 
-# Parameters of NCLaw's throws (notes of its experiments: E, nu, yield stress, friction angle); jelly is neo-Hookean here.
+# Parameters of NCLaw's throws (notes of its experiments: E, nu, yield stress, friction angle); jelly is neo-Hookean
+# here.
 MATERIALS = {
     "jelly": ("neo_hookean", {"youngs_modulus": 1e5, "poissons_ratio": 0.2}),
     "plasticine": ("von_mises", {"youngs_modulus": 3e5, "poissons_ratio": 0.25, "yield_stress": 5e3}),
@@ -82,7 +84,8 @@ def pretrain(
     """A neural law that behaves like ``material``, and how well.
 
     Returns the law and {"stress_error": relative RMS, "gradient_error": RMS of F over what the flow changes,
-    "position_error_mm": mean error of a 200-substep rollout from true states}. Raises InputError for an unknown material.
+    "position_error_mm": mean error of a 200-substep rollout from true states}. Raises InputError for an unknown
+    material.
     """
     if material not in MATERIALS:
         raise InputError(f"unknown material '{material}': use one of {', '.join(MATERIALS)}")

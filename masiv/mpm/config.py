@@ -6,7 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class SimulatorConfig(BaseModel):
-    """The grid and the step follow from the object: its volume, its particle count and the speed of sound of its law."""
+    """The grid and the step follow from the object: its volume, its particle count and the speed of sound of its
+    law."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -27,8 +27,8 @@ class _Rollout(torch.autograd.Function):
 def rollout(simulator: Simulator, law: Law, initial: State, steps: int, outputs: list[int]) -> torch.Tensor:
     """Positions (K, N, 3) [m, simulation frame] at the substeps ``outputs`` of ``steps`` substeps from ``initial``.
 
-    Differentiable with respect to the initial state and the parameters of the law. Bit-reproducible for a number of chunks.
-    Raises NonFiniteError.
+    Differentiable with respect to the initial state and the parameters of the law. Bit-reproducible for a number of
+    chunks. Raises NonFiniteError.
     """
     return _Rollout.apply(simulator, law, steps, outputs, *initial.tensors(), *law.parameters())
 

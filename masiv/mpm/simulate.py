@@ -61,8 +61,9 @@ def simulate(
 ) -> Motion:
     """The first ``frames`` frames of the twin's motion, frame 0 included.
 
-    velocity (3,) [m/s], omega (3,) [rad/s], gravity (3,) [m/s^2], world frame, replace what was identified; fps the video's.
-    Raises InputError for a value that is not finite or a frame count below 1, NonFiniteError where the motion diverges.
+    velocity (3,) [m/s], omega (3,) [rad/s], gravity (3,) [m/s^2], world frame, replace what was identified; fps the
+    video's. Raises InputError for a value that is not finite or a frame count below 1, NonFiniteError where the motion
+    diverges.
     """
     chosen = {"velocity": twin.velocity, "omega": twin.omega, "gravity": twin.gravity}
     for name, given in (("velocity", velocity), ("omega", omega), ("gravity", gravity)):

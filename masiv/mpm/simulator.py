@@ -47,10 +47,10 @@ class State:
 class Simulator:
     """MLS-MPM for ``particle_count`` particles of one body, in the simulation frame (y up, ground at y = 0).
 
-    spacing: grid cell [m]; substep [s]; volume: of the whole body at rest [m^3]; density [kg/m^3]; gravity (3,) [m/s^2];
-    contact: sticky (nodes in the ground are held), release (held while pressed, free to leave), slip (Coulomb friction
-    with coefficient ``friction``) or none. memory_mb bounds the states kept for the adjoint: a longer rollout keeps
-    only the state at the start of each segment and runs the segment again in the backward pass.
+    spacing: grid cell [m]; substep [s]; volume: of the whole body at rest [m^3]; density [kg/m^3]; gravity (3,)
+    [m/s^2]; contact: sticky (nodes in the ground are held), release (held while pressed, free to leave), slip (Coulomb
+    friction with coefficient ``friction``) or none. memory_mb bounds the states kept for the adjoint: a longer rollout
+    keeps only the state at the start of each segment and runs the segment again in the backward pass.
     """
 
     def __init__(
@@ -115,7 +115,9 @@ class Simulator:
         The margin covers twice the present top speed; ``reckless`` motion gets the most that the CFL limit allows.
         """
         box = self.k.bounds(s, self.count)
-        cells = WINDOW_EVERY if reckless else min(WINDOW_EVERY, 2.0 * WINDOW_EVERY * box[6] * self.substep / self.spacing)
+        cells = (
+            WINDOW_EVERY if reckless else min(WINDOW_EVERY, 2.0 * WINDOW_EVERY * box[6] * self.substep / self.spacing)
+        )
         margin = math.ceil(cells) + 1
         low = [math.floor(box[a] / self.spacing - 0.5) - margin for a in range(3)]
         high = [math.floor(box[3 + a] / self.spacing - 0.5) + 3 + margin for a in range(3)]
@@ -187,7 +189,9 @@ class Recording:
                 k.g2p(s, sim.count)
             too_fast, outside = k.read_fault()
             if too_fast >= 0:
-                raise NonFiniteError(start + (too_fast >> 32), too_fast & 0xFFFFFFFF, "non-finite or faster than a cell")
+                raise NonFiniteError(
+                    start + (too_fast >> 32), too_fast & 0xFFFFFFFF, "non-finite or faster than a cell"
+                )
             if outside < 0:
                 return
         raise NonFiniteError(start + (outside >> 32), outside & 0xFFFFFFFF, "non-finite position")

@@ -1,0 +1,166 @@
+"""Speed of the simulator: million particle-substeps a second, forward and forward + backward, beside plain Taichi
+autodiff.
+
+    python benchmarks/mpm_speed.py [--arch cpu] [--quick] > benchmarks/mpm_speed.md
+
+Cold compile is timed in new processes with Taichi's offline cache switched to an empty folder, warm with that folder
+filled. Peak memory is the process's high-water mark. Each row is the median of repeats in one process; compare rows of
+one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+SIDE, DT, STEPS = 0.5, 2e-4, 100
+
+
+def body(count):
+    import torch
+
+    generator = torch.Generator().manual_seed(0)
+    x = SIDE * torch.rand(count, 3, generator=generator)
+    x[:, 1] += 0.1
+    return x
+
+
+def time_masiv(law_name, count, repeats, arch):
+    import torch
+
+    torch.set_num_threads(1)
+    from masiv import runtime
+
+    began = time.perf_counter()
+    runtime.start(arch)
+    from masiv.materials.classical import ClassicalLaw
+    from masiv.materials.load import load_law
+    from masiv.materials.pretrain import pretrained_path
+    from masiv.mpm.rollout import at_rest, rollout
+    from masiv.mpm.simulator import Simulator
+
+    law = ClassicalLaw("neo_hookean", youngs_modulus=1e5, poissons_ratio=0.3)
+    if law_name == "neural":
+        law = load_law(pretrained_path("jelly"))
+    spacing = (6 * SIDE**3 / count) ** (1 / 3)
+    simulator = Simulator(particle_count=count, spacing=spacing, substep=DT, volume=SIDE**3, density=1e3,
+                          gravity=(0, -9.8, 0), max_substeps=STEPS, grid_nodes=1 << 18)  # fmt: skip
+    x = body(count).requires_grad_()
+    velocity = torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
+    still = torch.zeros(count, 3, 3)
+    rollout(simulator, law, at_rest(x, velocity, still), 1, [1]).sum().backward()
+    first = time.perf_counter() - began
+    forward, both = [], []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        end = rollout(simulator, law, at_rest(x, velocity, still), STEPS, [STEPS])
+        middle = time.perf_counter()
+        end.square().sum().backward()
+        forward.append(middle - start)
+        both.append(time.perf_counter() - start)
+    return first, forward, both
+
+
+def time_plain(count, repeats, arch):
+    from masiv import runtime
+
+    began = time.perf_counter()
+    ti = runtime.start(arch)
+    sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+    from mpm_plain import PlainMpm
+
+    spacing = (6 * SIDE**3 / count) ** (1 / 3)
+    x = body(count).numpy() + 4 * spacing
+    cells = int((SIDE + 0.1) / spacing) + 12
+    steps = STEPS if count < 20000 else 20
+    sim = PlainMpm(count, steps, cells, spacing, DT, 1e3 * SIDE**3 / count, SIDE**3 / count, 38462.0, 57692.0)
+
+    @ti.kernel
+    def fill(points: ti.types.ndarray()):
+        for p in range(count):
+            sim.x[0, p] = ti.Vector([points[p, 0], points[p, 1], points[p, 2]])
+            sim.v[0, p] = ti.Vector([0.0, -1.0, 0.0])
+            sim.c[0, p] = ti.Matrix.zero(ti.f32, 3, 3)
+            sim.f[0, p] = ti.Matrix.identity(ti.f32, 3)
+
+    fill(x)
+    sim.forward()
+    sim.backward()
+    first = time.perf_counter() - began
+    forward, both = [], []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        sim.forward()
+        middle = time.perf_counter()
+        sim.backward()
+        scale = STEPS / steps
+        forward.append((middle - start) * scale)
+        both.append((time.perf_counter() - start) * scale)
+    return first, forward, both
+
+
+def worker(kind, count, repeats, arch):
+    first, forward, both = (
+        time_plain(count, repeats, arch) if kind == "plain" else time_masiv(kind, count, repeats, arch)
+    )
+    rate = 1e-6 * count * STEPS
+    spread = (max(forward) - min(forward)) / statistics.median(forward)
+    print(json.dumps({
+        "first_s": first,
+        "forward": rate / statistics.median(forward),
+        "both": rate / statistics.median(both),
+        "spread": spread,
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }))  # fmt: skip
+
+
+def measure(kind, count, repeats, arch, cache):
+    command = [sys.executable, __file__, "--worker", kind, str(count), str(repeats), "--arch", arch]
+    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": cache}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--arch", default="cpu")
+    parser.add_argument("--quick", action="store_true", help="5,000 particles only")
+    parser.add_argument("--worker", nargs=3)
+    options = parser.parse_args()
+    if options.worker:
+        kind, count, repeats = options.worker
+        worker(kind, int(count), int(repeats), options.arch)
+        return
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    ).stdout.strip()
+    print("# Speed of the simulator\n")
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, `--arch {options.arch}`, float32, {STEPS} substeps"
+    print(f"{datetime.date.today()}, commit {commit}, {machine}.\n`python benchmarks/mpm_speed.py`\n")
+    print("Million particle-substeps a second: median of repeats, and the spread of the forward pass. First call: from")
+    print("starting Taichi to the first gradient, with an empty and with a filled kernel cache.\n")
+    print("| law | particles | forward | forward + backward | spread | first call, cold | warm | peak memory |")
+    print("|---|---|---|---|---|---|---|---|")
+    for count in (5000,) if options.quick else (1000, 5000, 50000):
+        for kind in ("neo_hookean", "neural", "plain"):
+            repeats = 9 if count < 20000 else 3
+            with tempfile.TemporaryDirectory() as cache:
+                cold = measure(kind, count, 1, options.arch, cache)
+                warm = measure(kind, count, repeats, options.arch, cache)
+            name = {"plain": "neo_hookean, plain Taichi: atomics, `kernel.grad()`"}.get(kind, kind)
+            speeds = f"{warm['forward']:.2f} | {warm['both']:.2f} | {100 * warm['spread']:.0f} %"
+            costs = f"{cold['first_s']:.1f} s | {warm['first_s']:.1f} s | {warm['memory_mb']:.0f} MB"
+            print(f"| {name} | {count:,} | {speeds} | {costs} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
