@@ -124,12 +124,15 @@ def _bars() -> Iterator[Callable[..., None]]:
 def _plain_lines() -> Callable[..., None]:
     began: dict[str, tuple[float, int]] = {}
     said: dict[str, float] = {}
+    last: dict[str, tuple[int, int, str]] = {}
 
     def report(stage: str, done: int, total: int, note: str = "") -> None:
         now = time.monotonic()
         start, first = began.setdefault(stage, (now, done))
-        if now - said.get(stage, now - PLAIN_EVERY_S) < PLAIN_EVERY_S and done < total:
+        recent = now - said.get(stage, now - PLAIN_EVERY_S) < PLAIN_EVERY_S
+        if recent and (done < total or last.get(stage) == (done, total, note)):
             return
+        last[stage] = done, total, note
         said[stage] = now
         left = (now - start) * (total - done) / (done - first) if done > first else None
         eta = "" if left is None or done >= total else f", {left:.0f} s left"

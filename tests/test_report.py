@@ -79,12 +79,13 @@ def test_log_gives_back_the_reported_numbers(tmp_path):
     for k in range(1, 6):
         report("fit", k, 5, f"loss {1 / k:.3f} mm, 7 frames")
     report("fit", 5, 5, "loss 9.5 mm")  # a resumed run repeats
-    report("words", 1, 1, "nothing")
+    for k, word in enumerate(("jelly", "sand", "water")):
+        report("choice", k, 3, f"{word} {k} mm")
     iterations, values, label = history.curves(tmp_path / "log.csv")["fit"]
     assert iterations == [1, 2, 3, 4, 5]
     assert values == [1, 0.5, 0.333, 0.25, 9.5]
     assert label == "loss mm"
-    assert "words" not in history.curves(tmp_path / "log.csv")
+    assert "choice" not in history.curves(tmp_path / "log.csv")
 
 
 def test_page_is_self_contained_and_escapes(tmp_path):

@@ -27,21 +27,22 @@ def logged(progress: Progress, path: Path) -> Progress:
 def curves(path: Path) -> dict[str, tuple[list[int], list[float], str]]:
     """For each stage that reported a number: iterations, values, and what the first number of its notes is.
 
-    A resumed stage repeats iterations; the last report of each counts.
+    A resumed stage repeats iterations; the last report of each counts. A stage whose reports are of different things,
+    such as candidates one after the other, has no curve.
     """
     if not path.is_file():
         return {}
     found: dict[str, dict[int, float]] = {}
-    labels: dict[str, str] = {}
+    labels: dict[str, set[str]] = {}
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.reader(file):
             note = row[3].split(",")[0] if len(row) == 4 else ""
             match = NUMBER.search(note)
             if match is not None:
                 found.setdefault(row[0], {})[int(row[1])] = float(match[0])
-                labels[row[0]] = " ".join((note[: match.start()] + note[match.end() :]).split())
+                labels.setdefault(row[0], set()).add(" ".join((note[: match.start()] + note[match.end() :]).split()))
     return {
-        stage: (sorted(values), [values[k] for k in sorted(values)], labels[stage])
+        stage: (sorted(values), [values[k] for k in sorted(values)], next(iter(labels[stage])))
         for stage, values in found.items()
-        if len(values) > 2
+        if len(values) > 2 and len(labels[stage]) == 1
     }

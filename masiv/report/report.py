@@ -137,11 +137,13 @@ def _twin_rows(twin: Twin) -> list[list[Any]]:
         ["ground height", None if twin.ground is None else float(twin.ground.height), "m"],
         ["contact", twin.contact, ""],
     ]
-    for name, value in [*twin.law.description().items(), *twin.fit.items()]:
-        if isinstance(value, Mapping) and "value" in value:
-            rows.append([name.replace("_", " "), value["value"], value.get("unit", "")])
-        elif isinstance(value, (str, int, float)):
-            rows.append([name.replace("_", " "), value, ""])
+    law = twin.law.description()
+    for group in ({"law": law.get("kind")}, law.get("parameters", {}), twin.fit):
+        for name, value in group.items():
+            if name == "history":
+                continue
+            quantity, unit = (value["value"], value["unit"]) if isinstance(value, Mapping) else (value, "")
+            rows.append([name.replace("_", " "), quantity, unit])
     return rows
 
 
