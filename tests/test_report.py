@@ -77,14 +77,14 @@ def test_draw_puts_a_gaussian_where_the_camera_projects_it(taichi):
 def test_log_gives_back_the_reported_numbers(tmp_path):
     report = history.logged(lambda *a: None, tmp_path / "log.csv")
     for k in range(1, 6):
-        report("fit", k, 5, f"loss {1 / k:.3f} mm, 7 frames")
-    report("fit", 5, 5, "loss 9.5 mm")  # a resumed run repeats
+        report("fit", k, 5, f"loss {1 / k:.3f} mm over {k} frames")
+    report("fit", 5, 5, "loss 9.5 mm over 9 frames")  # a resumed run repeats
     for k, word in enumerate(("jelly", "sand", "water")):
         report("choice", k, 3, f"{word} {k} mm")
     iterations, values, label = history.curves(tmp_path / "log.csv")["fit"]
     assert iterations == [1, 2, 3, 4, 5]
     assert values == [1, 0.5, 0.333, 0.25, 9.5]
-    assert label == "loss mm"
+    assert label == "loss mm over frames"
     assert "choice" not in history.curves(tmp_path / "log.csv")
 
 

@@ -40,7 +40,7 @@ def curves(path: Path) -> dict[str, tuple[list[int], list[float], str]]:
             match = NUMBER.search(note)
             if match is not None:
                 found.setdefault(row[0], {})[int(row[1])] = float(match[0])
-                labels.setdefault(row[0], set()).add(" ".join((note[: match.start()] + note[match.end() :]).split()))
+                labels.setdefault(row[0], set()).add(" ".join(NUMBER.sub("", note).split()))
     return {
         stage: (sorted(values), [values[k] for k in sorted(values)], next(iter(labels[stage])))
         for stage, values in found.items()
