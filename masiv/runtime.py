@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+from collections.abc import Iterator
 from typing import Any
 
 from masiv.errors import InputError
@@ -42,3 +43,17 @@ def start(arch: str = "cpu") -> Any:
 def running_arch() -> str:
     """The arch that Taichi runs on; cpu where it has not been started."""
     return _started or "cpu"
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Run torch on ``count`` threads for a while. Small networks between Taichi kernels are faster on one: two pools of
+    threads would spin against each other."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

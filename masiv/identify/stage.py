@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.config import IdentifyConfig
@@ -33,7 +34,19 @@ def identify(
 
     Nothing is assumed of the material: the pretrained law whose rollout is nearest to the motion is only the start.
     """
-    checkpoint = checkpoint or Checkpoint(None)
+    with runtime.torch_threads(1):
+        return _identify(scene, trajectory, config, simulator, seed, checkpoint or Checkpoint(None), progress)
+
+
+def _identify(
+    scene: Scene,
+    trajectory: Trajectory,
+    config: IdentifyConfig,
+    simulator: SimulatorConfig,
+    seed: int,
+    checkpoint: Checkpoint,
+    progress: Progress,
+) -> Twin:
     problem = Problem(scene, trajectory, config, simulator)
     launch = estimate_launch(
         trajectory.positions, trajectory.times, scene.gravity, scene.ground, clearance=problem.spacing

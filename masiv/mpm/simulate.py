@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from masiv import runtime
 from masiv.errors import InputError
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import at_rest
@@ -105,10 +106,11 @@ def simulate(
     start = torch.as_tensor(axes.points_to_simulation(twin.positions), dtype=torch.float32)
     state = thrown(start, tensors["velocity"], tensors["omega"])
     positions = [start]
-    for frame in range(1, frames):
-        recording = simulator.run(state, twin.law, steps, [steps])
-        state = recording.final
-        positions.append(recording.positions[0])
-        progress("simulate", frame, frames - 1)
+    with runtime.torch_threads(1):
+        for frame in range(1, frames):
+            recording = simulator.run(state, twin.law, steps, [steps])
+            state = recording.final
+            positions.append(recording.positions[0])
+            progress("simulate", frame, frames - 1)
     world = axes.points_to_world(torch.stack(positions).numpy())
     return Motion(np.asarray(world, dtype=np.float32), np.arange(frames) / rate)
