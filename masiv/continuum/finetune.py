@@ -142,7 +142,7 @@ def match(moved: np.ndarray, volumes: list[FilledVolume], start: FilledVolume) -
     more than a tenth does not pull either, the farthest first: it is hull that no camera sees.
     """
     targets, weights = moved.copy(), np.zeros(moved.shape[:2])
-    noise = 0.6 * start.spacing
+    noise = 0.8 * start.spacing
     for t, volume in enumerate(volumes):
         count, filled = len(moved[t]), len(volume.points)
         away, nearest = spatial.cKDTree(volume.points).query(moved[t])
