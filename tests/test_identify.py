@@ -1,0 +1,139 @@
+"""Launch, start and joint fit on trajectories simulated with a known law."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from masiv.checkpoint import Checkpoint
+from masiv.errors import InputError
+from masiv.identify.config import IdentifyConfig
+from masiv.identify.launch import estimate_launch
+from masiv.identify.stage import identify
+from masiv.materials.classical import ClassicalLaw
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.simulate import simulate
+from masiv.scene.scene import Ground, Scene
+from masiv.twin import Twin
+
+GRAVITY = np.array([0.0, -9.8, 0.0])
+UP = np.array([0.0, 1.0, 0.0])
+GROUND = Ground(UP, 0.0)
+FPS, FRAMES = 24.0, 9
+VELOCITY, OMEGA = np.array([0.5, -1.0, 0.2]), np.array([1.0, 2.0, -1.0])
+
+
+def no_picture(view, frame):
+    raise AssertionError("this fit has no business with pictures")
+
+
+def scene():
+    return Scene(
+        path=Path("simulated"), layout="none", fps=FPS, frame_count=FRAMES, cameras=(), gravity=GRAVITY, up=UP,
+        ground=GROUND, density=1000.0, load=no_picture, mask_source="none",
+    )  # fmt: skip
+
+
+class Seen:
+    """A trajectory known at the frames, linear between them."""
+
+    def __init__(self, positions, times, volume):
+        self.positions, self.times, self.volume = positions, times, volume
+
+    def evaluate(self, times):
+        exact = np.asarray(times) * FPS
+        low = np.clip(np.floor(exact).astype(int), 0, len(self.times) - 2)
+        share = (exact - low)[:, None, None]
+        return ((1 - share) * self.positions[low] + share * self.positions[low + 1]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def body():
+    axis = (np.arange(7) + 0.5) / 7 * 0.4
+    x = np.stack(np.meshgrid(axis, axis + 0.15, axis, indexing="ij"), -1).reshape(-1, 3)
+    return x.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def seen(taichi, body):
+    law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
+    truth = Twin(
+        positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
+        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(),
+    )  # fmt: skip
+    motion = simulate(truth, frames=FRAMES + 4)
+    return Seen(motion.positions[:FRAMES], motion.times[:FRAMES], 0.064), motion.positions
+
+
+def test_launch_of_a_rigid_throw(body):
+    times = np.arange(6) / FPS
+    centre = body.mean(0)
+    path = np.stack([
+        centre + VELOCITY * t + 0.5 * GRAVITY * t**2 + (body - centre) @ Rotation.from_rotvec(OMEGA * t).as_matrix().T
+        for t in times
+    ])  # fmt: skip
+    launch = estimate_launch(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
+    np.testing.assert_allclose(launch.velocity, VELOCITY, atol=1e-5)
+    np.testing.assert_allclose(launch.omega, OMEGA, atol=1e-5)
+    assert launch.last_frame == 5
+    # What follows the contact must not count.
+    path[4:] = path[3]
+    height = np.quantile(path[3] @ UP, 0.01) - 0.06
+    late = estimate_launch(path, times, GRAVITY, Ground(UP, height), clearance=0.08)
+    np.testing.assert_allclose(late.velocity, VELOCITY, atol=1e-5)
+
+
+def settings(**changes):
+    fast = dict(start="jelly", contact="sticky", iterations=14, silhouette_pictures=0, search_particles=200)
+    return IdentifyConfig(**(fast | changes))
+
+
+def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
+    trajectory, positions = seen
+    twin = identify(scene(), trajectory, settings(), SimulatorConfig())
+    predicted = simulate(twin, frames=FRAMES + 4).positions
+    error = np.linalg.norm(predicted - positions, axis=2).mean(1)
+    rigid = np.linalg.norm(positions[-1] - positions[0] - (positions[-1] - positions[0]).mean(0), axis=1).mean()
+    assert twin.fit["trajectory_error_mm"] < 8
+    assert error[FRAMES:].mean() < 0.025 < rigid
+    np.testing.assert_allclose(twin.velocity, VELOCITY, atol=0.1)
+
+
+def test_interrupted_identify_ends_with_the_same_numbers(seen, tmp_path):
+    class Stop(Exception):
+        pass
+
+    def stop_at_iteration_3(stage, done, total, note=""):
+        if stage == "identify: fit" and done == 3:
+            raise Stop
+
+    config = settings(iterations=5)
+    whole = identify(scene(), seen[0], config, SimulatorConfig())
+    path = tmp_path / "identify.pt"
+    with pytest.raises(Stop):
+        identify(scene(), seen[0], config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0),
+                 progress=stop_at_iteration_3)  # fmt: skip
+    assert path.exists()
+    resumed = identify(scene(), seen[0], config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0))
+    assert np.array_equal(whole.velocity, resumed.velocity)
+    assert whole.ground.height == resumed.ground.height
+    for name, value in whole.law.state_dict().items():
+        assert torch.equal(value, resumed.law.state_dict()[name])
+    assert whole.fit == resumed.fit
+
+
+def test_twin_survives_saving(seen, tmp_path):
+    twin = identify(scene(), seen[0], settings(iterations=1), SimulatorConfig())
+    twin.save(tmp_path)
+    again = Twin.load(tmp_path)
+    assert np.array_equal(simulate(twin, frames=4).positions, simulate(again, frames=4).positions)
+    # A prediction starts from the identified motion, and what is asked for has an effect.
+    thrown = simulate(again, frames=2, velocity=np.array([1.0, 0.0, 0.0]), gravity=np.zeros(3))
+    np.testing.assert_allclose((thrown.positions[1] - thrown.positions[0]).mean(0) * FPS, [1.0, 0.0, 0.0], atol=1e-3)
+    with pytest.raises(InputError, match="--velocity"):
+        simulate(again, frames=2, velocity=np.array([np.nan, 0.0, 0.0]))
+    (tmp_path / "twin.yaml").write_text("schema: 1\n")
+    with pytest.raises(InputError, match="no twin"):
+        Twin.load(tmp_path)
