@@ -24,7 +24,16 @@ pytestmark = pytest.mark.usefixtures("taichi")
 
 SIDE, FRAMES, FPS = 40, 4, 24.0
 CONFIG = ReconstructConfig(
-    gaussians=250, hull_resolution=20, crop_side=40, crop_padding=4, width=16, depth=1, space_octaves=1, iterations=260
+    gaussians=250,
+    hull_resolution=20,
+    crop_side=40,
+    crop_padding=4,
+    width=16,
+    depth=1,
+    space_octaves=1,
+    iterations=260,
+    first_frame_share=0.4,
+    growth_share=0.3,
 )
 
 
@@ -130,7 +139,7 @@ def test_resumed_run_ends_with_the_same_numbers(scene, result, tmp_path):
         return progress
 
     # In the first frame's share, while frames come in, and after the first pruning with all of them in.
-    for step in (20, 90, 230):
+    for step in (20, 140, 230):
         with pytest.raises(KeyboardInterrupt):
             reconstruct(part, CONFIG, seed=4, checkpoint=checkpoint, progress=interrupt_at(step))
         assert checkpoint.load()["iteration"] == step

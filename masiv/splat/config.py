@@ -23,8 +23,8 @@ class ReconstructConfig(BaseModel):
     space_octaves: int = Field(3, ge=0, description="octaves of the encoding of a position")
     time_octaves: int = Field(6, ge=0, description="octaves of the encoding of time, at most; few frames allow fewer")
 
-    iterations: int = Field(9000, ge=1, description="steps, each on one frame")
-    views: int = Field(2, ge=1, description="pictures a step")
+    iterations: int = Field(9000, ge=1, description="steps, each on a few pictures")
+    pictures: int = Field(3, ge=1, description="pictures a step; the first shows the newest frame while frames come in")
     first_frame_share: float = Field(0.1, ge=0, le=0.5, description="share of the steps on frame 0 alone")
     growth_share: float = Field(0.5, ge=0, le=0.9, description="share of the steps in which the other frames come in")
 
@@ -34,12 +34,14 @@ class ReconstructConfig(BaseModel):
     scale_rate: float = Field(1e-2, gt=0, description="step of log sizes at first")
     opacity_rate: float = Field(3e-2, gt=0, description="step of opacity logits at first")
     colour_rate: float = Field(2e-2, gt=0, description="step of colour logits at first")
+    followed_rate: float = Field(0.15, gt=0, le=1, description="share of means_rate left once frame 0 is fitted")
     final_rate: float = Field(0.05, gt=0, le=1, description="share of a step that is left at the end")
 
     ssim_weight: float = Field(0.2, ge=0, le=1, description="of 1 - SSIM; the rest is L1")
     alpha_weight: float = Field(0.5, ge=0, description="of alpha against the mask")
     scale_weight: float = Field(0.002, ge=0, description="of the mean size over its first value")
-    rigidity_weight: float = Field(0.1, ge=0, description="of squared strain between neighbours")
-    hull_weight: float = Field(0.5, ge=0, description="of the distance to a frame's hull; fades out by the end")
+    rigidity_weight: float = Field(0.3, ge=0, description="of squared strain between neighbours")
+    hull_weight: float = Field(0.3, ge=0, description="of the distance to a frame's hull; fades out by the end")
+    ground_weight: float = Field(1.0, ge=0, description="of the depth below the ground")
     neighbours: int = Field(8, ge=1, description="neighbours a Gaussian in the rigidity term")
     prune_opacity: float = Field(0.02, ge=0, lt=1, description="Gaussians below it are removed")

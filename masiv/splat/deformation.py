@@ -96,6 +96,11 @@ class DeformationNetwork(torch.nn.Module):
         times = torch.as_tensor(times, dtype=positions.dtype, device=positions.device)
         return self._evaluate(positions, times)[..., :3]
 
+    def changes(self, positions: torch.Tensor, times: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """As ``forward`` at ``times`` (K,) [s]: displacements (K, N, 3) [m] and changes of log scale (K, N)."""
+        moved = self._evaluate(positions, times)
+        return moved[..., :3], moved[..., 3]
+
     def base_displacements(self, times: torch.Tensor) -> torch.Tensor:
         """The base motion's share of a displacement at ``times`` (K,) [s]: (K, 3) [m]."""
         return self._base(times * self.fps) - self.base_motion[0]

@@ -48,11 +48,11 @@ def strain(
 ) -> torch.Tensor:
     """Mean squared relative change of length between neighbours, a scalar: 0 for a rigid motion.
 
-    rest, displacement (N, 3) [m]; first, second (P,) ends of the pairs; softening [m] is added to the rest length, so
-    that two Gaussians that nearly coincide do not rule the sum.
+    rest (N, 3), displacement (..., N, 3) [m]; first, second (P,) ends of the pairs; softening [m] is added to the rest
+    length, so that two Gaussians that nearly coincide do not rule the sum.
     """
     before = rest[second] - rest[first]
-    after = before + displacement[second] - displacement[first]
+    after = before + displacement[..., second, :] - displacement[..., first, :]
     length = _length(before)
     return ((_length(after) - length) / (length + softening)).square().mean()
 

@@ -15,16 +15,14 @@ from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.gaussians import Gaussians
-from masiv.splat.losses import neighbour_pairs, ssim, strain
+from masiv.splat.losses import neighbour_pairs
+from masiv.splat.objective import Objective
 from masiv.splat.observe import Observation, observe
 from masiv.splat.pull import HullPull, continue_motion
-from masiv.splat.rasteriser import render
 from masiv.splat.start import Start, starting_point
 
 __all__ = ["DynamicGaussians", "reconstruct"]
 
-_PULLED = 700
-"""Gaussians, and points of a hull, that one step measures."""
 _NAMES = ("means", "log_scales", "opacity_logits", "colour_logits")
 
 
@@ -57,8 +55,9 @@ class _Fit:
         self.identity = repr((config.model_dump(), seed, str(scene.path), scene.frame_count, scene.views))
         progress("reconstruct", 0, config.iterations, "carving hulls")
         start = starting_point(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
-        self.first_scale, self.half_extent = start.scale, start.half_extent
-        self.pulls = [HullPull(hull) for hull in start.hulls]
+        self.half_extent = start.half_extent
+        hulls = tuple(HullPull(hull) for hull in start.hulls)
+        self.objective = Objective(config, start.scale, start.half_extent, scene.fps, scene.ground, hulls)
         if state is not None and state["identity"] == self.identity:
             self._resume(state)
         else:
@@ -149,18 +148,17 @@ class _Fit:
         )
 
     def step(self) -> float:
-        """One step of Adam on a few views of one frame; the loss."""
+        """One step of Adam on a few pictures; the loss."""
         c = self.config
         rng = np.random.default_rng((self.seed, 1 + self.iteration))
-        frame = self._choose_frame(rng)
-        shown = self.observations[frame]
-        chosen = rng.permutation(len(shown))[: c.views]
-        background = torch.tensor(rng.random(3), dtype=torch.float32)
+        pictures = self._choose_pictures(rng)
         for group in self.optimiser.param_groups:
             group["lr"] = group["rate"] * c.final_rate**self.settling
-
+        if self.frames > 1:
+            # Points that go on sliding over the surface while frames come in would take the motion with them.
+            self.optimiser.param_groups[0]["lr"] *= c.followed_rate
         self.optimiser.zero_grad(set_to_none=True)
-        loss = self._loss(frame, [shown[k] for k in chosen], background, rng)
+        loss = self.objective(self.parameters, self.network, self.pairs, pictures, 1 - self.settling, rng)
         value = float(loss.detach())
         if not np.isfinite(value):
             raise MasivError(
@@ -172,46 +170,18 @@ class _Fit:
         frames = self.frames
         self.iteration += 1
         if self.frames > frames:
-            self._continue_motion(rng)
+            means = self.parameters["means"].detach()
+            continue_motion(self.network, means, self.frames - 1, c.motion_rate, rng)
         if self.iteration in self._pruning_steps():
             self._prune()
         return value
 
-    def _choose_frame(self, rng: np.random.Generator) -> int:
-        """While frames come in, the newest one a third of the time: it is followed before the next one comes."""
-        if self.frames < self.scene.frame_count and rng.random() < 1 / 3:
-            return self.frames - 1
-        return int(rng.integers(self.frames))
-
-    def _loss(
-        self, frame: int, shown: list[Observation], background: torch.Tensor, rng: np.random.Generator
-    ) -> torch.Tensor:
-        c, p = self.config, self.parameters
-        means, log_scales = p["means"], p["log_scales"]
-        regulariser = c.scale_weight * log_scales.exp().mean() / self.first_scale
-        if frame > 0:
-            # The position goes into the network without a gradient, as in MASIV: the motion answers for the motion.
-            displacement, log_change = self.network(means.detach(), frame / self.scene.fps)
-            if c.rigidity_weight > 0:
-                stretched = strain(means.detach(), displacement, *self.pairs, softening=self.first_scale)
-                regulariser = regulariser + c.rigidity_weight * stretched
-            means, log_scales = means + displacement, log_scales + log_change
-            if c.hull_weight > 0 and self.settling < 1:
-                far = self.pulls[frame](p["means"].detach() + displacement, _PULLED, rng)
-                regulariser = regulariser + c.hull_weight * (1 - self.settling) * far / self.half_extent
-        scales, opacities, colours = (
-            log_scales.exp(),
-            torch.sigmoid(p["opacity_logits"]),
-            torch.sigmoid(p["colour_logits"]),
-        )
-        total = torch.zeros(())
-        for view in shown:
-            drawn = render(view.camera, means, scales, opacities, colours, background)
-            total = total + _difference(drawn.rgb, drawn.alpha, view, background, c)
-        return total / len(shown) + regulariser
-
-    def _continue_motion(self, rng: np.random.Generator) -> None:
-        continue_motion(self.network, self.parameters["means"].detach(), self.frames - 1, self.config.motion_rate, rng)
+    def _choose_pictures(self, rng: np.random.Generator) -> list[tuple[int, Observation]]:
+        """The newest frame while frames come in, so that it is followed before the next one comes; others at random."""
+        frames = rng.integers(self.frames, size=self.config.pictures)
+        if self.frames < self.scene.frame_count:
+            frames[0] = self.frames - 1
+        return [(int(f), self.observations[f][rng.integers(len(self.observations[f]))]) for f in frames]
 
     def _pruning_steps(self) -> tuple[int, ...]:
         """After frame 0 alone, and twice while all frames are in."""
@@ -246,17 +216,3 @@ def _observations(scene: Scene, config: ReconstructConfig) -> list[list[Observat
         if not found[-1]:
             raise MasivError(f"frame {frame} of {scene.path}: no view shows the object; check its masks")
     return found
-
-
-def _difference(
-    rgb: torch.Tensor, alpha: torch.Tensor, view: Observation, background: torch.Tensor, config: ReconstructConfig
-) -> torch.Tensor:
-    """(1 - l) L1 + l (1 - SSIM) over the background, plus alpha against the mask; pixels behind an occluder agree."""
-    target = view.colour + (1 - view.mask)[..., None] * background
-    rgb = torch.lerp(target, rgb, view.valid[..., None])
-    absolute = (rgb - target).abs().mean()
-    silhouette = ((alpha - view.mask) * view.valid).abs().mean()
-    similarity = ssim(rgb, target) if config.ssim_weight > 0 else 1.0
-    return (
-        (1 - config.ssim_weight) * absolute + config.ssim_weight * (1 - similarity) + config.alpha_weight * silhouette
-    )

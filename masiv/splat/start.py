@@ -27,9 +27,8 @@ class Start:
 
 def starting_point(scene: Scene, count: int, resolution: int, rng: np.random.Generator) -> Start:
     """Start from the visual hulls of ``scene``. Raises MasivError where a hull is empty, as ``visual_hull`` does."""
-    hull = visual_hull(scene, 0, resolution=resolution)
-    later = [visual_hull(scene, f, resolution=max(8, resolution // 2)) for f in range(1, scene.frame_count)]
-    hulls = (hull, *later)
+    hulls = tuple(visual_hull(scene, frame, resolution=resolution) for frame in range(scene.frame_count))
+    hull = hulls[0]
     centroids = np.stack([h.points.mean(axis=0) for h in hulls])
     shell = hull.points[hull.surface]
     if len(shell) < 2:
