@@ -25,7 +25,7 @@ class ReconstructConfig(BaseModel):
 
     iterations: int = Field(9000, ge=1, description="steps, each on a few pictures")
     pictures: int = Field(3, ge=1, description="pictures a step; the first shows the newest frame while frames come in")
-    first_frame_share: float = Field(0.1, ge=0, le=0.5, description="share of the steps on frame 0 alone")
+    first_frame_share: float = Field(0.12, ge=0, le=0.5, description="share of the steps on frame 0 alone")
     growth_share: float = Field(0.5, ge=0, le=0.9, description="share of the steps in which the other frames come in")
 
     means_rate: float = Field(2e-3, gt=0, description="step of positions at first")
@@ -34,7 +34,7 @@ class ReconstructConfig(BaseModel):
     scale_rate: float = Field(1e-2, gt=0, description="step of log sizes at first")
     opacity_rate: float = Field(3e-2, gt=0, description="step of opacity logits at first")
     colour_rate: float = Field(2e-2, gt=0, description="step of colour logits at first")
-    followed_rate: float = Field(0.15, gt=0, le=1, description="share of means_rate left once frame 0 is fitted")
+    followed_rate: float = Field(0.1, gt=0, le=1, description="share of means_rate left once frame 0 is fitted")
     final_rate: float = Field(0.05, gt=0, le=1, description="share of a step that is left at the end")
 
     ssim_weight: float = Field(0.2, ge=0, le=1, description="of 1 - SSIM; the rest is L1")
