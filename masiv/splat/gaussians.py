@@ -38,7 +38,7 @@ class Gaussians:
     def save_ply(self, path: Path) -> None:
         """Write ``path`` (float32, binary PLY) through a temporary name. Raises MasivError for non-finite values."""
         count = len(self)
-        columns = {name: np.zeros(count, np.float32) for name in _COLUMNS}
+        columns: dict[str, np.ndarray] = {name: np.zeros(count) for name in _COLUMNS}
         means, colours = self.means.detach().cpu().numpy(), self.colours.detach().cpu().numpy()
         for axis, name in enumerate("xyz"):
             columns[name] = means[:, axis]
@@ -46,7 +46,7 @@ class Gaussians:
             columns[f"scale_{axis}"] = self.scales.detach().double().log().cpu().numpy()
         opacities = self.opacities.detach().double().clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
         columns["opacity"] = torch.logit(opacities).cpu().numpy()
-        columns["rot_0"] = np.ones(count, np.float32)
+        columns["rot_0"] = np.ones(count)
         rows = np.empty(count, dtype=[(name, "f4") for name in _COLUMNS])
         for name, column in columns.items():
             if not np.isfinite(column).all():

@@ -83,7 +83,7 @@ class _Fit:
         self.network.load_state_dict(state["network"])
         self._start_optimiser()
         self.optimiser.load_state_dict(state["optimiser"])
-        self.pairs = tuple(state["pairs"])
+        self.pairs = state["pairs"][0], state["pairs"][1]
 
     def state(self) -> dict[str, Any]:
         """All that a resumed fit needs, as tensors and plain values."""
@@ -123,8 +123,9 @@ class _Fit:
         self._find_neighbours()
 
     def _find_neighbours(self) -> None:
-        pairs = neighbour_pairs(self.parameters["means"].detach().double().numpy(), self.config.neighbours)
-        self.pairs = tuple(torch.from_numpy(p) for p in pairs)
+        means = self.parameters["means"].detach().double().numpy()
+        first, second = neighbour_pairs(means, self.config.neighbours)
+        self.pairs = torch.from_numpy(first), torch.from_numpy(second)
 
     @property
     def frames(self) -> int:
