@@ -7,7 +7,8 @@ from typing import Protocol
 
 class Progress(Protocol):
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """``done`` of ``total`` iterations of ``stage`` are finished; ``note`` is a short status (a loss with its unit)."""
+        """``done`` of ``total`` iterations of ``stage`` are finished; ``note`` is a short status (a loss with its
+        unit)."""
         ...
 
 

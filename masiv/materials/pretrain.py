@@ -79,7 +79,7 @@ def throw(material: str) -> Throw:
 
 
 def pretrain(
-    material: str, *, seed: int = 0, pointwise: int = 4000, epochs: int = 30, progress: Progress = silent
+    material: str, *, seed: int = 0, pointwise: int = 6000, epochs: int = 8, progress: Progress = silent
 ) -> tuple[NeuralLaw, dict[str, float]]:
     """A neural law that behaves like ``material``, and how well.
 

@@ -17,6 +17,7 @@ from masiv.splat.gaussians import Gaussians
 UNITS = {
     "psnr_db": "dB, whole picture, object on black",
     "psnr_box_db": "dB, box of the observed mask, object on black",
+    "psnr_box_in_scene_db": "dB, box of the observed mask, object before the view's own empty background",
     "ssim": "1, whole picture",
     "ssim_box": "1, box of the observed mask",
     "mask_iou": "1",
@@ -47,6 +48,15 @@ def picture_numbers(
             reference = on_black(observed.image, observed.mask * observed.valid)
             image[~observed.valid] = 0
             score = metrics.picture_scores(image, reference, observed.mask)
+            plate = scene.background(view)
+            if plate is not None and (box := metrics.mask_box(observed.mask)) is not None:
+                # On black, half a pixel of outline outweighs all that is inside of it; a viewer sees the object in its
+                # scene.
+                placed, _ = draw(gaussians, scene.cameras[view], plate)
+                share = (observed.mask * observed.valid)[..., None]
+                seen = np.round(observed.image * share + plate * (1 - share)).astype(np.uint8)
+                placed[~observed.valid] = seen[~observed.valid]
+                score["psnr_box_in_scene_db"] = metrics.psnr(placed[box], seen[box])
             score["mask_iou"] = metrics.mask_iou(alpha * observed.valid, observed.mask * observed.valid)
             scores.append(score)
             by_frame[frame].append(score.get("psnr_box_db", np.nan))

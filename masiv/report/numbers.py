@@ -117,7 +117,8 @@ def evaluation_numbers(
 
 
 COLUMNS = {
-    "psnr_box_db": "PSNR box [dB]",
+    "psnr_box_in_scene_db": "PSNR box, in scene [dB]",
+    "psnr_box_db": "PSNR box, on black [dB]",
     "psnr_db": "PSNR [dB]",
     "ssim": "SSIM",
     "mask_iou": "mask IoU",

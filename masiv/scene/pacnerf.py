@@ -84,6 +84,7 @@ def read(folder: Path, declaration: SceneDeclaration) -> Scene:
         density=declaration.density or DENSITY,
         load=reader.load,
         mask_source=source,
+        background=reader.background,
         problems=(*problems, *more),
         fit_frames=declaration.fit_frames,
     )
@@ -250,6 +251,13 @@ class _Pictures:
         if self.crops is not None:
             mask = mask * self.crops[view]
         return Frame(image[..., :3], mask, valid)
+
+    def background(self, view: int) -> np.ndarray | None:
+        """The empty scene in ``view``, (H, W, 3) uint8, where there is a picture of it."""
+        if view not in self.backgrounds:
+            return None
+        camera = self.cameras[view]
+        return self._read(self.backgrounds[view], (camera.height, camera.width))[..., :3]
 
     def mask_sources(self) -> tuple[str, list[str]]:
         """The main source of the masks, in words, and a problem for each picture set that has another one."""

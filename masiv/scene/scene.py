@@ -30,10 +30,15 @@ class Frame:
     valid: np.ndarray
 
 
+def _unknown_background(view: int) -> np.ndarray | None:
+    return None
+
+
 @dataclass(frozen=True)
 class Scene:
     """Multi-view video of one object. World axes, metres, seconds.
 
+    ``background(view)`` is the picture (H, W, 3) uint8 of the empty scene, or None.
     ``load(view, frame)`` reads a picture; use ``frame(view, frame)``, which caches and checks the bounds.
     Frames are integers 0…frame_count-1; times follow as frame / fps. ``fit_frames`` is what scene.yaml
     asks for, if anything. A missing picture has ``valid`` False everywhere.
@@ -50,6 +55,7 @@ class Scene:
     density: float
     load: Callable[[int, int], Frame]
     mask_source: str
+    background: Callable[[int], np.ndarray | None] = _unknown_background
     problems: tuple[str, ...] = ()
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
