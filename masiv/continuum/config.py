@@ -19,7 +19,7 @@ class TrajectoryConfig(BaseModel):
     learning_rate: float = Field(2e-3, gt=0, description="first step size; it falls to 2 % along a cosine")
     batch: int = Field(2048, ge=1, description="particles drawn for each step, all frames of each")
     match_every: int = Field(10, ge=1, description="steps between two nearest-neighbour searches")
-    chamfer_weight: float = Field(4.0, ge=0, description="to the filled volume of each frame")
+    chamfer_weight: float = Field(1.0, ge=0, description="to the filled volume of each frame")
     silhouette_weight: float = Field(1.0, ge=0, description="particles outside of a mask")
     motion_weight: float = Field(0.3, ge=0, description="surface motion that the pictures gave stays")
     smoothness_weight: float = Field(0.3, ge=0, description="second differences of the motion")
