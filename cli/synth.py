@@ -25,14 +25,14 @@ def synth(
     """
     from masiv import runtime
     from masiv.config import load_config
-    from masiv.strict import read_yaml, validated
-    from masiv.synth.spec import SynthSpec
+    from masiv.synth.spec import read_spec
 
     from .console import progress_bar
 
     settings = load_config(preset, config, seed=seed, arch=arch)
-    given = {} if seed is None else {"seed": seed}
-    request = validated(SynthSpec, {**read_yaml(spec), **given}, str(spec))
+    request = read_spec(spec)
+    if seed is not None:
+        request = request.model_copy(update={"seed": settings.seed})
     runtime.start(settings.arch)
     from masiv.synth.synthesise import synthesise
 
