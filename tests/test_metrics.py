@@ -34,7 +34,7 @@ def test_chamfer_samples_at_most_max_points_and_repeats():
 def test_chamfer_floor_is_that_of_a_dense_sampling():
     """Mean squared distance to the nearest of n points a unit volume is Γ(5/3) (3 / 4πn)^(2/3)."""
     points = np.random.default_rng(1).random((20000, 3))
-    expected = 2 * 0.9027 * (3 / (4 * np.pi * 10000)) ** (2 / 3) * 1e3
+    expected = 2 * 0.9027 * (3 / (4 * np.pi * 20000)) ** (2 / 3) * 1e3
     assert metrics.chamfer_floor(points, max_points=10**6) == pytest.approx(expected, rel=0.08)
 
 

@@ -18,9 +18,6 @@ from masiv.mpm.simulator import Simulator
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import SimulationFrame
 
-STIFFENING = 2.0
-"""A law is given a substep for this multiple of its modulus at rest: it stiffens as it is compressed."""
-
 
 @dataclass
 class Motion:
@@ -77,7 +74,7 @@ class Problem:
         """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number."""
         count = substeps_per_frame(
             spacing=self.spacing,
-            wave_modulus=STIFFENING * law.wave_modulus(),
+            wave_modulus=law.wave_modulus(),
             density=self.scene.density,
             speed=self.speed,
             frame_time=1 / self.scene.fps,

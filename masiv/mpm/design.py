@@ -7,6 +7,9 @@ import math
 from masiv.errors import MasivError
 from masiv.mpm.config import SimulatorConfig
 
+STIFFENING = 2.0
+"""A law stiffens as it is compressed: the substep is for this multiple of its modulus at rest."""
+
 
 def grid_spacing(volume: float, particle_count: int, config: SimulatorConfig) -> float:
     """Cell size [m] at which ``particle_count`` particles fill ``volume`` [m^3] with ``particles_per_cell`` each."""
@@ -16,9 +19,10 @@ def grid_spacing(volume: float, particle_count: int, config: SimulatorConfig) ->
 def substeps_per_frame(
     *, spacing: float, wave_modulus: float, density: float, speed: float, frame_time: float, config: SimulatorConfig
 ) -> int:
-    """Substeps in a frame such that sound, sqrt(wave_modulus / density), and matter at ``speed`` [m/s] cross at most
-    ``courant_number`` cells in each. Raises MasivError where that is more than the configuration allows."""
-    crossing = math.sqrt(max(wave_modulus, 0.0) / density) + speed
+    """Substeps in a frame such that sound and matter at ``speed`` [m/s] together cross at most ``courant_number`` cells
+    in each. Sound is sqrt(STIFFENING wave_modulus / density), wave_modulus [Pa] that of the law at rest. Raises
+    MasivError where that is more than the configuration allows."""
+    crossing = math.sqrt(STIFFENING * max(wave_modulus, 0.0) / density) + speed
     count = max(1, math.ceil(frame_time * crossing / (config.courant_number * spacing)))
     if count > config.max_substeps_per_frame:
         raise MasivError(

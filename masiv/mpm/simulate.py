@@ -77,40 +77,45 @@ def simulate(
     rate = twin.fps if fps is None else fps
     axes = SimulationFrame.from_scene(twin.up, twin.ground)
     turned = {name: axes.vectors_to_simulation(value) for name, value in chosen.items()}
-    count = len(twin.positions)
-    spacing = grid_spacing(twin.volume, count, twin.simulator)
-    speed = float(np.linalg.norm(chosen["velocity"]) + np.linalg.norm(chosen["gravity"]) * frames / rate)
-    steps = substeps_per_frame(
-        spacing=spacing,
-        wave_modulus=twin.law.wave_modulus(),
-        density=twin.density,
-        speed=speed,
-        frame_time=1 / rate,
-        config=twin.simulator,
-    )
-    simulator = Simulator(
-        particle_count=count,
-        spacing=spacing,
-        substep=1 / (rate * steps),
-        volume=twin.volume,
-        density=twin.density,
-        gravity=turned["gravity"],
-        contact=twin.contact if twin.ground is not None else "none",
-        friction=twin.friction,
-        memory_mb=twin.simulator.memory_mb,
-        max_substeps=steps,
-        grid_nodes=twin.simulator.grid_nodes,
-        chunks=twin.simulator.chunks,
-    )
     tensors = {k: torch.as_tensor(v, dtype=torch.float32) for k, v in turned.items()}
     start = torch.as_tensor(axes.points_to_simulation(twin.positions), dtype=torch.float32)
     state = thrown(start, tensors["velocity"], tensors["omega"])
     positions = [start]
     with runtime.torch_threads(1):
         for frame in range(1, frames):
+            simulator, steps = _for_one_frame(twin, state, turned["gravity"], rate)
             recording = simulator.run(state, twin.law, steps, [steps])
             state = recording.final
             positions.append(recording.positions[0])
             progress("simulate", frame, frames - 1)
     world = axes.points_to_world(torch.stack(positions).numpy())
     return Motion(np.asarray(world, dtype=np.float32), np.arange(frames) / rate)
+
+
+def _for_one_frame(twin: Twin, state: State, gravity: np.ndarray, fps: float) -> tuple[Simulator, int]:
+    """A simulator and its number of substeps for the next frame: as many as the present speed asks for."""
+    spacing = grid_spacing(twin.volume, len(twin.positions), twin.simulator)
+    speed = float(state.velocity.norm(dim=1).max()) + float(np.linalg.norm(gravity)) / fps
+    steps = substeps_per_frame(
+        spacing=spacing,
+        wave_modulus=twin.law.wave_modulus(),
+        density=twin.density,
+        speed=speed,
+        frame_time=1 / fps,
+        config=twin.simulator,
+    )
+    simulator = Simulator(
+        particle_count=len(twin.positions),
+        spacing=spacing,
+        substep=1 / (fps * steps),
+        volume=twin.volume,
+        density=twin.density,
+        gravity=gravity,
+        contact=twin.contact if twin.ground is not None else "none",
+        friction=twin.friction,
+        memory_mb=twin.simulator.memory_mb,
+        max_substeps=64,  # longer frames run in segments: one capacity, one compile
+        grid_nodes=twin.simulator.grid_nodes,
+        chunks=twin.simulator.chunks,
+    )
+    return simulator, steps

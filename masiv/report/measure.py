@@ -23,7 +23,7 @@ UNITS = {
     "mask_iou": "1",
     "trajectory_rmse_mm": "mm, root mean square over particles and frames",
     "chamfer_1e3mm2": "10³ mm², squared, mean, both directions summed",
-    "chamfer_floor_1e3mm2": "10³ mm², two disjoint halves of the truth",
+    "chamfer_floor_1e3mm2": "10³ mm², two random samplings of the same truth",
     "tracked_error_mm": "mm, mean distance to the true displacement",
     "seconds": "s",
 }

@@ -1,0 +1,117 @@
+"""The whole job as a user runs it: synthesise, identify, get killed, go on, evaluate, simulate what was never
+filmed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+SPEC = {
+    "shape": {"kind": "cube", "size": 0.4, "rotation_deg": [20, 30, 0], "clearance": 0.25},
+    "material": {"law": "neo_hookean", "parameters": {"youngs_modulus": 4e4, "poissons_ratio": 0.3}},
+    "velocity": [0.5, -1.5, 0.0],
+    "frames": 6,
+    "cameras": {"count": 6, "size": 48, "field_of_view_deg": 28},
+    "truth_particles": 500,
+}
+TINY = {
+    "reconstruct": {"gaussians": 250, "hull_resolution": 24, "iterations": 120, "width": 16, "depth": 1},
+    "trajectory": {"particle_count": 300, "fill_resolution": 24, "iterations": 20},
+    "identify": {"start": "jelly", "contact": "sticky", "search_particles": 150, "iterations": 4},
+}
+
+
+def masiv(*arguments):
+    code = "from masiv.cli.main import run; run()"
+    return [sys.executable, "-c", code, *map(str, arguments)]
+
+
+def done(*arguments):
+    """What the command prints on stdout: one JSON object."""
+    ended = subprocess.run(masiv(*arguments, "--json"), capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    return json.loads(ended.stdout)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pipeline")
+    (folder / "spec.yaml").write_text(yaml.safe_dump(SPEC))
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    done("synth", folder / "spec.yaml", "--out", folder / "scene")
+    # A fit must not need the truth, so it is not there to be read.
+    os.rename(folder / "scene" / "gt", folder / "gt")
+    os.remove(folder / "scene" / "truth.yaml")
+    return folder
+
+
+def identify(folder, name):
+    return ("identify", folder / "scene", "--out", folder / name, "--config", folder / "tiny.yaml", "--fit-frames", 5)
+
+
+@pytest.fixture(scope="module")
+def whole(folder):
+    """A run that nothing interrupted."""
+    done(*identify(folder, "whole"))
+    return folder / "whole"
+
+
+def killed_in(stage, folder, name):
+    """Start the command and kill it, as a power cut would, once ``stage`` is at work."""
+    process = subprocess.Popen(
+        masiv(*identify(folder, name)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    state = folder / name / "run.yaml"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and process.poll() is None:
+        if state.exists() and yaml.safe_load(state.read_text())["stages"][stage]["state"] == "running":
+            break
+        time.sleep(0.05)
+    assert process.poll() is None, "the command ended before it could be killed"
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def test_killed_run_ends_with_the_numbers_of_a_whole_one(folder, whole):
+    killed_in("reconstruct", folder, "broken")
+    killed_in("identify", folder, "broken")
+    done(*identify(folder, "broken"))
+    for name in ("trajectory.npz", "rollout.npz"):
+        first, second = (np.load(path / name)["positions"] for path in (whole, folder / "broken"))
+        assert np.array_equal(first, second)
+    assert (whole / "twin.yaml").read_bytes() == (folder / "broken/twin.yaml").read_bytes()
+    for name in ("gaussians.ply", "deformation.safetensors", "law.safetensors", "metrics.json", "report.html"):
+        assert (folder / "broken" / name).stat().st_size > 0
+    rollout = np.load(whole / "rollout.npz")
+    assert rollout["positions"].shape[0] == len(rollout["times"]) == SPEC["frames"]
+    assert rollout["positions"].dtype == np.float32
+
+
+def test_evaluate_separates_observed_from_future(folder, whole):
+    numbers = done("evaluate", whole, "--truth", folder / "gt")
+    twin = numbers["motion"]["twin"]
+    assert twin["observed"]["frames"] == [0, 1, 2, 3, 4]
+    assert twin["future"]["frames"] == [5]
+    rigid = numbers["motion"]["rigid, stops at the ground"]
+    assert twin["observed"]["tracked_error_mm"] < 25
+    assert twin["future"]["tracked_error_mm"] < rigid["future"]["tracked_error_mm"]
+
+
+def test_simulate_starts_from_the_identified_motion(folder, whole):
+    done("simulate", whole, "--frames", 3, "--out", folder / "same")
+    as_filmed, again = (np.load(path / "rollout.npz")["positions"] for path in (whole, folder / "same"))
+    assert np.array_equal(as_filmed[:3], again)
+    done(
+        "simulate", whole, "--frames", 3, "--velocity", "1,0,0", "--gravity=0,0,0", "--out", folder / "new", "--render"
+    )
+    new = np.load(folder / "new" / "rollout.npz")
+    drift = (new["positions"][1] - new["positions"][0]).mean(0) / new["times"][1]
+    np.testing.assert_allclose(drift, [1.0, 0.0, 0.0], atol=2e-3)
+    assert (folder / "new" / "video.mp4").stat().st_size > 0
+    assert len(list((folder / "new" / "views").rglob("*.png"))) == 3
