@@ -8,8 +8,6 @@ filled. Peak memory is the process's high-water mark. Each row is the median of 
 one run.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import json
