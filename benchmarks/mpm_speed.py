@@ -10,6 +10,7 @@ one run.
 
 import argparse
 import datetime
+import functools
 import json
 import os
 import platform
@@ -106,7 +107,16 @@ def time_plain(count, repeats, arch):
     return first, forward, both
 
 
+def use_cache(folder):
+    """Taichi takes the folder of its kernel cache from ti.init alone."""
+    os.environ["ENABLE_TAICHI_HEADER_PRINT"] = "False"
+    import taichi as ti
+
+    ti.init = functools.partial(ti.init, offline_cache_file_path=folder)
+
+
 def worker(kind, count, repeats, arch):
+    use_cache(os.environ["KERNEL_CACHE"])
     first, forward, both = (
         time_plain(count, repeats, arch) if kind == "plain" else time_masiv(kind, count, repeats, arch)
     )
@@ -119,11 +129,14 @@ def worker(kind, count, repeats, arch):
         "spread": spread,
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }))  # fmt: skip
+    import taichi as ti
+
+    ti.reset()  # writes the kernel cache
 
 
 def measure(kind, count, repeats, arch, cache):
     command = [sys.executable, __file__, "--worker", kind, str(count), str(repeats), "--arch", arch]
-    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": cache}
+    environment = {**os.environ, "KERNEL_CACHE": cache}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 

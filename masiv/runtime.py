@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import io
 import os
@@ -32,6 +33,7 @@ def start(arch: str = "cpu") -> Any:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, where stdout may be for one JSON object
         ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0)
+    atexit.register(ti.reset)  # writes the kernel cache, which the next command starts from
     running = ti.lang.impl.current_cfg().arch
     if arch != "cpu" and running != known[arch]:
         ti.reset()
