@@ -138,16 +138,25 @@ class _BoundClassical(BoundLaw):
         self.kernels.write_coefficients(self.per_particle)
         self.kernels.owner = self
 
-    def forward(self, s: int, count: int) -> None:
+    def _own(self) -> None:
         if self.kernels.owner is not self:  # another rollout used the same fields since
             self._write()
+
+    def forward(self, s: int, count: int) -> None:
+        self._own()
         self.kernels.forward(s, count)
+
+    def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
+        if mpm.gpu:
+            super().p2g(mpm, s, count, nodes)
+        else:
+            self._own()
+            self.kernels.forward_p2g(s, count, nodes)
 
     def backward(self, s: int, count: int) -> None:
         if self.law.kind not in DIFFERENTIABLE:
             raise MasivError(f"law {self.law.kind} has no adjoint: identify with a neural law, or with neo_hookean")
-        if self.kernels.owner is not self:
-            self._write()
+        self._own()
         self.kernels.backward(s, count)
 
     def parameter_gradients(self) -> tuple[torch.Tensor | None, ...]:

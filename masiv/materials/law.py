@@ -19,6 +19,11 @@ class BoundLaw(ABC):
     def forward(self, s: int, count: int) -> None:
         """Trial gradient at substep s -> elastic deformation gradient and Kirchhoff stress at s."""
 
+    def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
+        """``forward``, then the transfer to the grid; a law that can do both in one pass over the particles does."""
+        self.forward(s, count)
+        mpm.p2g(s, count, nodes)
+
     @abstractmethod
     def backward(self, s: int, count: int) -> None:
         """``gradient_bar``, ``stress_bar`` -> ``trial_bar`` at substep s; parameter gradients are summed up."""

@@ -134,10 +134,6 @@ class Simulator:
         self.k.set_window(*window)
         return math.prod(window[3:])
 
-    def momentum_on_grid(self, s: int, nodes: int) -> None:
-        self.k.p2g(s, self.count, nodes)
-        self.k.grid_update(nodes)
-
 
 class Recording:
     """What a rollout keeps: the positions asked for, and what its adjoint needs."""
@@ -184,8 +180,8 @@ class Recording:
             nodes = sim.set_window(window)
             k.clear_fault()
             for s in range(begin, end):
-                self.bound.forward(s, sim.count)
-                sim.momentum_on_grid(s, nodes)
+                self.bound.p2g(k, s, sim.count, nodes)
+                k.grid_update(nodes)
                 k.g2p(s, sim.count)
             too_fast, outside = k.read_fault()
             if too_fast >= 0:
@@ -232,7 +228,8 @@ class Recording:
                 window = self.windows[start + s - s % WINDOW_EVERY]
                 if window is not current:
                     nodes, current = sim.set_window(window), window
-                sim.momentum_on_grid(s, nodes)
+                k.p2g(s, sim.count, nodes)
+                k.grid_update(nodes)
                 k.g2p_adjoint(s, sim.count, nodes)
                 k.grid_adjoint(nodes)
                 k.p2g_adjoint(s, sim.count)
