@@ -143,7 +143,7 @@ def _isochoric(f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tenso
 
 @functools.lru_cache(maxsize=8)
 def _neural_kernels(mpm):
-    from masiv.kernels.laws import NeuralKernels
+    from masiv.kernels.neural import NeuralKernels
 
     return NeuralKernels(mpm)
 
