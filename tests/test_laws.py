@@ -1,5 +1,6 @@
 """Constitutive laws: what must hold whatever the weights are, kernels against definitions, analytic cases."""
 
+import itertools
 import math
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
-from masiv.materials.classical import PARAMETERS, ClassicalLaw
+from masiv.materials.classical import DIFFERENTIABLE, PARAMETERS, ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw, strain_invariants
 from masiv.materials.pretrain import MATERIALS, pretrained_path
@@ -22,6 +23,8 @@ EXAMPLES = {
     "neo_hookean": {"youngs_modulus": 1e5, "poissons_ratio": 0.3},
     "water": {"youngs_modulus": 1e5, "poissons_ratio": 0.3},
     "von_mises": {"youngs_modulus": 1e5, "poissons_ratio": 0.3, "yield_stress": 3e3},
+    "newtonian": {"viscosity": 40.0, "bulk_modulus": 3e5},
+    "non_newtonian": {"shear_modulus": 1e4, "bulk_modulus": 5e4, "yield_stress": 300.0, "plastic_viscosity": 15.0},
     "drucker_prager": {"youngs_modulus": 1e5, "poissons_ratio": 0.3, "friction_angle": 30.0},
 }
 
@@ -106,7 +109,7 @@ def test_kernels_equal_the_definition(name):
     ours = torch.as_tensor(sim.k.deformation_gradient.to_numpy()[0, :64])
     stress = torch.as_tensor(sim.k.kirchhoff_stress.to_numpy()[0, :64])
     # Taichi's singular value decomposition stops at about 1e-6.
-    tolerance = 1e-4 if name in ("von_mises", "drucker_prager") else 1e-9
+    tolerance = 1e-4 if name in ("von_mises", "non_newtonian", "drucker_prager") else 1e-9
     torch.testing.assert_close(ours, expected.expand_as(f).contiguous(), rtol=tolerance, atol=0.01 * tolerance)
     scale = float(law.stress(expected.expand_as(f)).detach().abs().max())
     torch.testing.assert_close(
@@ -136,6 +139,112 @@ def test_sand_bears_no_tension_and_stays_in_its_cone():
     limit = math.sqrt(2 / 3) * 2 * sine / (3 - sine) * 3 * pressure
     assert bool((deviator <= limit + 1e-6 * deviator.max()).all())
     assert float((deviator / limit).max()) > 0.999
+
+
+def sheared(law, rate, dt, duration):
+    """Stress of a steady simple shear x += rate y t, flowed for ``duration`` [s]."""
+    step = torch.eye(3, dtype=F64)[None].clone()
+    step[0, 0, 1] = rate * dt
+    f = torch.eye(3, dtype=F64)[None]
+    for _ in range(round(duration / dt)):
+        f = law.project(step @ f, dt)
+    return law.stress(f)[0].detach()
+
+
+@pytest.mark.parametrize("dt", [2e-3, 5e-4, 1e-4])
+def test_shear_stress_of_a_newtonian_fluid_is_viscosity_times_rate(dt):
+    law = ClassicalLaw("newtonian", **EXAMPLES["newtonian"])
+    for rate in (0.5, 5.0, 20.0):
+        tau = sheared(law, rate, dt, 0.04)
+        assert float(tau[0, 1]) == pytest.approx(40 * rate, rel=0.01)
+        assert float((tau - tau.T).abs().max()) < 1e-6
+        # The first normal stress difference is second order: 2 x shear stress x rate x (relaxation time or substep).
+        assert abs(float(tau[0, 0] - tau[1, 1])) < 2 * 40 * rate * rate * (dt + 5e-4)
+    assert float(sheared(law, 0.0, dt, 0.01).abs().max()) == 0
+
+
+def test_newtonian_shear_converges_as_the_substep_shrinks():
+    """While the shear starts, the stress is that of a Maxwell element, eta rate (1 - exp(-t / relaxation time))."""
+    law = ClassicalLaw("newtonian", viscosity=4000.0, bulk_modulus=3e5)
+    time = 4000 / float(law.elastic_moduli()[0].detach())
+    assert time < 2e-3
+    exact = 4000 * 2 * (1 - math.exp(-1))
+    errors = [abs(float(sheared(law, 2.0, time / n, time)[0, 1]) - exact) for n in (4, 8, 16, 32)]
+    assert errors[-1] < 0.02 * exact
+    for coarse, fine in itertools.pairwise(errors):
+        assert fine == pytest.approx(coarse / 2, rel=0.15)
+
+
+def test_pressure_of_a_newtonian_fluid_is_taits():
+    law = ClassicalLaw("newtonian", **EXAMPLES["newtonian"])
+    for j in (0.97, 1.0, 1.02):
+        f = law.project(j ** (1 / 3) * torch.eye(3, dtype=F64)[None], 1e-3)
+        tau = law.stress(f)[0].detach().numpy()
+        # Cauchy pressure of Tait's equation with exponent 7, and Kirchhoff stress -p J.
+        pressure = 3e5 / 7 * (j**-7 - 1)
+        np.testing.assert_allclose(tau, -pressure * j * np.eye(3), atol=1e-6)
+
+
+def test_bingham_body_in_simple_shear():
+    """yield / sqrt(2) + eta rate above the yield stress; elastic below, where it rests for ever."""
+    law = ClassicalLaw("non_newtonian", **EXAMPLES["non_newtonian"])
+    for dt in (1e-3, 2.5e-4):
+        stresses = [float(sheared(law, rate, dt, 0.4 / rate)[0, 1]) for rate in (2.0, 4.0, 8.0)]
+        np.testing.assert_allclose(stresses, [300 / math.sqrt(2) + 15 * rate for rate in (2.0, 4.0, 8.0)], rtol=0.02)
+    f = torch.eye(3, dtype=F64)[None].clone()
+    f[0, 0, 1] = 0.9 * 300 / math.sqrt(2) / 1e4
+    torch.testing.assert_close(law.project(f, 10.0), f, rtol=0, atol=1e-9)
+
+
+def test_bingham_body_yields_by_hand():
+    """One substep of an isochoric stretch and of a pressure, with formulas by hand."""
+    law = ClassicalLaw("non_newtonian", **EXAMPLES["non_newtonian"])
+    dt, stretch = 1e-3, math.log(1.05)
+    f = torch.diag(torch.exp(torch.tensor([stretch, -stretch / 2, -stretch / 2], dtype=F64)))[None]
+    size, limit = math.sqrt(1.5) * stretch, 300 / 2e4
+    viscous = 15 / (1e4 * dt)
+    kept = limit + (size - limit) * viscous / (1 + viscous)
+    out = law.project(f, dt)
+    assert float(torch.log(out[0, 0, 0].detach())) == pytest.approx(stretch * kept / size, rel=1e-9)
+    tau = law.stress(out)[0].detach().numpy()
+    np.testing.assert_allclose(np.diag(tau), 2e4 * kept / size * stretch * np.array([1, -0.5, -0.5]), rtol=1e-9)
+    squeezed = law.project(0.98 * torch.eye(3, dtype=F64)[None], dt)
+    np.testing.assert_allclose(
+        law.stress(squeezed)[0].detach().numpy(), 3 * 5e4 * math.log(0.98) * np.eye(3), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("kind", list(PARAMETERS))
+def test_classical_laws_are_at_rest_when_undeformed_and_do_not_see_rotations(kind):
+    law, q = ClassicalLaw(kind, **EXAMPLES[kind]), torch.as_tensor(Rotation.random(random_state=5).as_matrix())
+    rest = torch.eye(3, dtype=F64)[None]
+    assert float(law.stress(law.project(rest, 1e-3)).detach().abs().max()) == 0
+    f = 0.97 * gradients(8, 0.05)
+    tau, turned = (law.stress(law.project(g, 1e-3)).detach() for g in (f, q @ f))
+    torch.testing.assert_close(turned, q @ tau @ q.T, rtol=1e-7, atol=1e-7 * float(tau.abs().max()))
+
+
+@pytest.mark.usefixtures("taichi")
+@pytest.mark.parametrize("kind", DIFFERENTIABLE)
+def test_adjoint_of_a_classical_law_equals_autograd(kind):
+    law, f = ClassicalLaw(kind, **EXAMPLES[kind]), gradients(8, 0.05)
+    sim = Simulator(particle_count=8, spacing=0.1, substep=1e-3, volume=1.0, density=1.0, gravity=(0, 0, 0), dtype=F64,
+                    max_substeps=64, grid_nodes=1 << 15)  # fmt: skip
+    zeros = torch.zeros(8, 3, dtype=F64)
+    sim.k.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
+    bound = law.bind(sim.k, 8, 1e-3)
+    bound.forward(0, 8)
+    bars = gradients(8, 1.0, seed=1), 1e-4 * gradients(8, 1.0, seed=2)
+    sim.k.gradient_bar.from_numpy(np.resize(bars[0].numpy(), (1024, 3, 3)))
+    sim.k.stress_bar.from_numpy(np.resize(bars[1].numpy(), (1024, 3, 3)))
+    bound.backward(0, 8)
+    trial = f.clone().requires_grad_()
+    out = law.project(trial, 1e-3)
+    expected = torch.autograd.grad([out, law.stress(out)], [trial, *law.parameters()], bars, allow_unused=True)
+    ours = torch.as_tensor(sim.k.trial_bar.to_numpy()[:8])
+    torch.testing.assert_close(ours, expected[0], rtol=1e-8, atol=1e-8 * float(expected[0].abs().max()))
+    for mine, theirs in zip(bound.parameter_gradients(), expected[1:], strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=0)
 
 
 def test_uniaxial_stress_of_neo_hookean_at_small_strain():
@@ -174,11 +283,16 @@ def test_pretrained_law_resembles_its_material(material, squeeze):
 
 
 def test_laws_survive_saving(tmp_path):
-    for law in (NeuralLaw(seed=9), ClassicalLaw("von_mises", **EXAMPLES["von_mises"])):
+    estimated = ClassicalLaw("von_mises", **EXAMPLES["von_mises"])
+    estimated.stderr = {"youngs_modulus": 12.0, "poissons_ratio": math.inf, "yield_stress": 3.0}
+    for law in (NeuralLaw(seed=9), estimated):
         law.save(tmp_path / "law.safetensors")
         again = load_law(tmp_path / "law.safetensors")
         f = gradients(5).float() if isinstance(law, NeuralLaw) else gradients(5)
         assert torch.equal(law.stress(f), again.stress(f))
+        assert law.description() == again.description()
+    assert estimated.description()["parameters"]["youngs_modulus"] == {"value": 1e5, "unit": "Pa", "stderr": 12.0}
+    assert estimated.description()["parameters"]["poissons_ratio"]["stderr"] is None
     (tmp_path / "law.safetensors").write_bytes(b"nonsense")
     with pytest.raises(InputError, match="not a law"):
         load_law(tmp_path / "law.safetensors")

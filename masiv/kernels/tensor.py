@@ -148,8 +148,8 @@ def principal_strain(f):
 
 @ti.func
 def von_mises(f, c):
-    """c = (mu, lambda, yield stress) [Pa]. Hencky elasticity, return to |dev eps| = yield / (2 mu) (PAC-NeRF,
-    plasticine)."""
+    """c = (mu, lambda, yield stress) [Pa]. Hencky elasticity, return to |dev eps| = yield / (2 mu), so that |dev tau| =
+    yield (Simo 1992; PAC-NeRF's and textbooks' yield stress, of uniaxial tension, is sqrt(3/2) times it)."""
     u, strain, v = principal_strain(f)
     mean = strain.sum() / 3.0
     dev = strain - mean
@@ -179,9 +179,46 @@ def drucker_prager(f, c):
     return hencky(u, kept, v, c[0], c[1])
 
 
+@ti.func
+def newtonian(f, c):
+    """c = (G, K/7, share) [Pa, Pa, 1]: a Maxwell fluid whose relaxation time is too short to be seen.
+
+    A substep keeps 1 - share = 1 / (1 + dt G / eta) of the isochoric strain (backward Euler), so that at a steady rate
+    D the strain kept is D eta / G and the stress 2 eta D, at any dt. A law sees no velocity gradient, and an explicit
+    viscous stress would bound the substep by dx^2; this one is bounded by the speed of sound. Pressure is Tait's with
+    exponent 7, tau = K/7 (J - J^-6) I (Becker & Teschner 2007; PAC-NeRF's fluid has viscosity mu / 2 and K = 7 kappa).
+    """
+    kept = neural_flow(f, ti.Vector([c[2], 0.0 * c[2]]))
+    j = kept.determinant()
+    b = power_of_third(j, -2) * (kept @ kept.transpose())
+    j2 = j * j
+    return kept, c[0] * deviator(b) + (c[1] * (j - 1.0 / (j2 * j2 * j2))) * identity3()
+
+
+@ti.func
+def non_newtonian(f, c):
+    """c = (mu, lambda, yield stress, a) [Pa, Pa, Pa, 1], a = eta / (mu dt). A Bingham body on Hencky elasticity.
+
+    |dev tau| = yield + 2 eta |plastic rate| (Perzyna's overstress with exponent 1, backward Euler), in simple shear
+    yield / sqrt(2) + eta rate: the viscoplastic return mapping of Yue et al. 2015, "Continuum foam", as in PAC-NeRF,
+    whose yield stress is sqrt(3/2) and whose plastic viscosity is twice those here.
+    """
+    u, strain, v = principal_strain(f)
+    mean = strain.sum() / 3.0
+    dev = strain - mean
+    size = dev.norm()
+    limit = c[2] / (2.0 * c[0])
+    kept = strain
+    if size > limit:
+        kept = mean + ((limit + (size - limit) * c[3] / (1.0 + c[3])) / size) * dev
+    return hencky(u, kept, v, c[0], c[1])
+
+
 CLASSICAL = {
     "neo_hookean": neo_hookean,
     "water": water,
+    "newtonian": newtonian,
     "von_mises": von_mises,
+    "non_newtonian": non_newtonian,
     "drucker_prager": drucker_prager,
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -14,14 +15,32 @@ from masiv.materials.law import BoundLaw, Law
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
 
+ELASTIC = ("youngs_modulus", "poissons_ratio")
 PARAMETERS = {
-    "neo_hookean": ("youngs_modulus", "poissons_ratio"),
-    "water": ("youngs_modulus", "poissons_ratio"),
-    "von_mises": ("youngs_modulus", "poissons_ratio", "yield_stress"),
-    "drucker_prager": ("youngs_modulus", "poissons_ratio", "friction_angle"),
+    "neo_hookean": ELASTIC,
+    "water": ELASTIC,
+    "newtonian": ("viscosity", "bulk_modulus"),
+    "von_mises": (*ELASTIC, "yield_stress"),
+    "non_newtonian": ("shear_modulus", "bulk_modulus", "yield_stress", "plastic_viscosity"),
+    "drucker_prager": (*ELASTIC, "friction_angle"),
 }
-UNITS = {"youngs_modulus": "Pa", "poissons_ratio": "1", "yield_stress": "Pa", "friction_angle": "deg"}
+UNITS = {
+    "youngs_modulus": "Pa",
+    "poissons_ratio": "1",
+    "shear_modulus": "Pa",
+    "bulk_modulus": "Pa",
+    "viscosity": "Pa s",
+    "yield_stress": "Pa",
+    "plastic_viscosity": "Pa s",
+    "friction_angle": "deg",
+}
+RANGES = {"poissons_ratio": (-1.0, 0.5), "friction_angle": (0.0, 90.0)}
+"""Where a parameter must lie; (0, infinity) where none is given."""
 DIFFERENTIABLE = ("neo_hookean", "water")
+MAXWELL_SHARE = 0.25
+MAXWELL_TIME = 2e-3
+"""The shear modulus of a Newtonian fluid is that share of its bulk modulus plus viscosity / that time [s]: it relaxes
+within the time, far less than a flow takes to change between two frames, and hardly shortens the substep."""
 
 
 def lame(youngs_modulus: torch.Tensor, poissons_ratio: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -33,6 +52,7 @@ def lame(youngs_modulus: torch.Tensor, poissons_ratio: torch.Tensor) -> tuple[to
 class ClassicalLaw(Law):
     """A law of ``PARAMETERS``, its parameters given by name in the units of ``UNITS``.
 
+    ``stderr``: standard errors of the parameters by name, where they were estimated.
     Raises InputError for an unknown kind, missing or unknown parameters, and values outside of their range.
     """
 
@@ -44,11 +64,14 @@ class ClassicalLaw(Law):
             raise InputError(
                 f"law {kind} needs exactly {', '.join(PARAMETERS[kind])}, got {', '.join(parameters) or 'none'}"
             )
-        if not (parameters["youngs_modulus"] > 0 and -1 < parameters["poissons_ratio"] < 0.5):
-            raise InputError(f"law {kind}: youngs_modulus must be > 0 and poissons_ratio within (-1, 0.5)")
-        if parameters.get("yield_stress", 1.0) <= 0 or not 0 < parameters.get("friction_angle", 1.0) < 90:
-            raise InputError(f"law {kind}: yield_stress must be > 0 Pa and friction_angle within (0, 90) degrees")
+        for name, value in parameters.items():
+            low, high = RANGES.get(name, (0.0, math.inf))
+            if not low < value < high:
+                raise InputError(
+                    f"law {kind}: {name} = {value} {UNITS[name]} is out of range: give a value within ({low}, {high})"
+                )
         self.kind = kind
+        self.stderr: dict[str, float] = {}
         self.values = torch.nn.ParameterDict(
             {
                 name: torch.nn.Parameter(torch.tensor(float(parameters[name]), dtype=torch.float64))
@@ -61,60 +84,105 @@ class ClassicalLaw(Law):
         """The law whose ``state_dict`` is ``state``."""
         return cls(kind, **{name.removeprefix("values."): float(value) for name, value in state.items()})
 
-    def coefficients(self) -> torch.Tensor:
-        """What the kernels take, shape (K,): see the ``c`` of each function in ``masiv.kernels.tensor``."""
+    def elastic_moduli(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Lamé's mu and lambda [Pa] at rest; mu of a Newtonian fluid is that of its fast relaxation, of water 0."""
+        if self.kind == "newtonian":
+            mu = MAXWELL_SHARE * self.values["bulk_modulus"] + self.values["viscosity"] / MAXWELL_TIME
+            return mu, self.values["bulk_modulus"] - 2 / 3 * mu
+        if self.kind == "non_newtonian":
+            mu = self.values["shear_modulus"]
+            return mu, self.values["bulk_modulus"] - 2 / 3 * mu
         mu, lam = lame(self.values["youngs_modulus"], self.values["poissons_ratio"])
+        return (torch.zeros_like(mu) if self.kind == "water" else mu), lam
+
+    def coefficients(self, dt: float) -> torch.Tensor:
+        """What the kernels take in a substep of dt [s], shape (K,): see the ``c`` of each function in
+        ``masiv.kernels.tensor``."""
+        mu, lam = self.elastic_moduli()
         if self.kind == "neo_hookean":
             return torch.stack([mu, lam])
         if self.kind == "water":
             return lam[None]
+        if self.kind == "newtonian":
+            return torch.stack([mu, self.values["bulk_modulus"] / 7, dt * mu / (dt * mu + self.values["viscosity"])])
         if self.kind == "von_mises":
             return torch.stack([mu, lam, self.values["yield_stress"]])
+        if self.kind == "non_newtonian":
+            return torch.stack([mu, lam, self.values["yield_stress"], self.values["plastic_viscosity"] / (mu * dt)])
         sine = torch.sin(torch.deg2rad(self.values["friction_angle"]))
         return torch.stack([mu, lam, math.sqrt(2 / 3) * 2 * sine / (3 - sine)])
 
     def project(self, trial_gradient: torch.Tensor, dt: float) -> torch.Tensor:
         if self.kind == "neo_hookean":
             return trial_gradient
+        c = self.coefficients(dt).to(trial_gradient.dtype)
         if self.kind == "water":
             eye = torch.eye(3, dtype=trial_gradient.dtype)
             return torch.linalg.det(trial_gradient)[:, None, None] ** (1 / 3) * eye
+        if self.kind == "newtonian":
+            return isochoric_flow(trial_gradient, c[2])
         u, s, vh = torch.linalg.svd(trial_gradient)
         strain = torch.log(s)
-        c = self.coefficients().to(strain.dtype)
         trace = strain.sum(1, keepdim=True)
         deviator = strain - trace / 3
         size = deviator.norm(dim=1, keepdim=True).clamp_min(torch.finfo(strain.dtype).tiny)
         if self.kind == "von_mises":
             kept = trace / 3 + deviator * (c[2] / (2 * c[0]) / size).clamp_max(1)
+        elif self.kind == "non_newtonian":
+            excess = (size - c[2] / (2 * c[0])).clamp_min(0)
+            kept = trace / 3 + deviator * (1 - excess / size / (1 + c[3]))
         else:
             excess = size + (3 * c[1] + 2 * c[0]) / (2 * c[0]) * trace * c[2]
             kept = torch.where(trace >= 0, 0 * strain, strain - excess.clamp_min(0) * deviator / size)
         return u @ torch.diag_embed(torch.exp(kept)) @ vh
 
     def stress(self, deformation_gradient: torch.Tensor) -> torch.Tensor:
-        c = self.coefficients().to(deformation_gradient.dtype)
+        mu, lam = (m.to(deformation_gradient.dtype) for m in self.elastic_moduli())
         eye = torch.eye(3, dtype=deformation_gradient.dtype)
         j = torch.linalg.det(deformation_gradient)[:, None, None]
         if self.kind == "neo_hookean":
-            return c[0] * (deformation_gradient @ deformation_gradient.mT - eye) + c[1] * torch.log(j) * eye
+            return mu * (deformation_gradient @ deformation_gradient.mT - eye) + lam * torch.log(j) * eye
         if self.kind == "water":
-            return c[0] * j * (j - 1) * eye
+            return lam * j * (j - 1) * eye
+        if self.kind == "newtonian":
+            b = j ** (-2 / 3) * (deformation_gradient @ deformation_gradient.mT)
+            bulk = self.values["bulk_modulus"].to(b.dtype)
+            return mu * (b - b.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * eye) + bulk / 7 * (j - j**-6) * eye
         u, s, _ = torch.linalg.svd(deformation_gradient)
         strain = torch.log(s)
-        principal = 2 * c[0] * strain + c[1] * strain.sum(1, keepdim=True)
+        principal = 2 * mu * strain + lam * strain.sum(1, keepdim=True)
         return u @ torch.diag_embed(principal) @ u.mT
 
     def wave_modulus(self) -> float:
-        mu, lam = lame(self.values["youngs_modulus"].detach(), self.values["poissons_ratio"].detach())
-        return float(lam if self.kind == "water" else lam + 2 * mu)
+        mu, lam = self.elastic_moduli()
+        return float((lam + 2 * mu).detach())
 
     def bind(self, kernels: MpmKernels, count: int, dt: float) -> BoundLaw:
-        return _BoundClassical(self, kernels, count)
+        return _BoundClassical(self, kernels, count, dt)
 
     def description(self) -> dict[str, Any]:
-        values = {name: {"value": float(value), "unit": UNITS[name]} for name, value in self.values.items()}
+        """An estimated parameter also has ``stderr``, None where the data does not tell it."""
+        values: dict[str, dict[str, Any]] = {}
+        for name, value in self.values.items():
+            values[name] = {"value": float(value), "unit": UNITS[name]}
+            if name in self.stderr:
+                values[name]["stderr"] = self.stderr[name] if math.isfinite(self.stderr[name]) else None
         return {"kind": self.kind, "parameters": values}
+
+    def file_metadata(self) -> dict[str, str]:
+        return {"kind": self.kind, "stderr": json.dumps(self.stderr)}
+
+
+def isochoric_flow(f: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
+    """F (N, 3, 3) after a ``share`` of its isochoric Hencky strain has flowed: ``masiv.kernels.tensor.neural_flow``."""
+    eye = torch.eye(3, dtype=f.dtype)
+    b = torch.linalg.det(f)[:, None, None] ** (-2 / 3) * (f @ f.mT)
+    b_inverse = torch.linalg.inv(b)
+    traces = [a.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] for a in (b, b_inverse)]
+    deviator = b - b_inverse - (traces[0] - traces[1]) / 3 * eye
+    half = 0.125 * share / torch.sqrt(1 + (0.5 * (traces[0] + traces[1]) - 3) / 3) * deviator
+    m = torch.linalg.solve(eye + half, eye - half)
+    return torch.linalg.det(m)[:, None, None] ** (-1 / 3) * (m @ f)
 
 
 @functools.lru_cache(maxsize=8)
@@ -125,10 +193,11 @@ def _classical_kernels(mpm, kind: str, coefficients: int):
 
 
 class _BoundClassical(BoundLaw):
-    def __init__(self, law: ClassicalLaw, mpm: MpmKernels, count: int) -> None:
+    def __init__(self, law: ClassicalLaw, mpm: MpmKernels, count: int, dt: float) -> None:
         self.law = law
+        self.dt = dt
         self.mpm = mpm
-        self.values = law.coefficients()
+        self.values = law.coefficients(dt)
         self.kernels = _classical_kernels(mpm, law.kind, len(self.values))
         dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
         self.per_particle = self.values.detach().to(dtype).expand(count, -1).contiguous()
@@ -163,4 +232,4 @@ class _BoundClassical(BoundLaw):
         gradient = torch.empty_like(self.per_particle)
         self.kernels.read_coefficient_gradients(gradient)
         names = list(self.law.parameters())
-        return torch.autograd.grad(self.law.coefficients(), names, gradient.double().sum(0), allow_unused=True)
+        return torch.autograd.grad(self.law.coefficients(self.dt), names, gradient.double().sum(0), allow_unused=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -23,6 +24,8 @@ def load_law(path: Path) -> Law:
             NeuralLaw(width=int(metadata["width"])) if kind == NeuralLaw.kind else ClassicalLaw.from_state(kind, state)
         )
         law.load_state_dict(state)
+        if isinstance(law, ClassicalLaw):
+            law.stderr = json.loads(metadata.get("stderr", "{}"))
     except (SafetensorError, FileNotFoundError, KeyError, RuntimeError) as error:
         raise InputError(f"{path} is not a law written by masiv ({error}): run identify or pretrain again") from error
     return law
