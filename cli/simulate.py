@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +19,26 @@ def simulate(
     ] = None,
     omega: Annotated[str | None, typer.Option("--omega", metavar="WX,WY,WZ", help="Initial spin [rad/s].")] = None,
     gravity: Annotated[str | None, typer.Option("--gravity", metavar="GX,GY,GZ", help="Gravity [m/s²].")] = None,
+    law: Annotated[Path | None, typer.Option("--law", metavar="OTHER_RUN", help="The material of another run.")] = None,
+    blend: Annotated[
+        float | None, typer.Option("--blend", metavar="W", help="With --law: 0 is this run's material, 1 the other's.")
+    ] = None,
+    geometry: Annotated[
+        Path | None,
+        typer.Option("--geometry", metavar="MESH|OTHER_RUN", help="Another body: a closed mesh, or another run's."),
+    ] = None,
+    density: Annotated[float | None, typer.Option("--density", help="Density [kg/m³].")] = None,
+    ground: Annotated[
+        str | None, typer.Option("--ground", metavar="none|HEIGHT", help="No ground, or one at this height [m].")
+    ] = None,
+    force: Annotated[
+        str | None,
+        typer.Option("--force", metavar="FX,FY,FZ", help="Force on the whole body [N], spread over its mass."),
+    ] = None,
+    force_from: Annotated[float | None, typer.Option("--force-from", help="When it starts [s]. [default: 0]")] = None,
+    force_until: Annotated[
+        float | None, typer.Option("--force-until", help="When it ends [s]. [default: never]")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Where to write. [default: RUN/simulate]")] = None,
     render: Annotated[bool, typer.Option("--render", help="Also draw views/*.png and video.mp4.")] = False,
     view: Annotated[
@@ -32,6 +53,8 @@ def simulate(
     """Throw the twin anew: rollout.npz, and pictures with --render. What is not given is as identified.
 
     Example: `masiv simulate runs/bunny --frames 32 --velocity=1,2,0 --gravity=0,-1.6,0 --out moon --render`
+
+    Another: `masiv simulate runs/bunny --frames 32 --law runs/cross --blend 0.5 --force=0,0,900 --force-until 0.1`
     """
     from masiv.errors import InputError
 
@@ -50,18 +73,36 @@ def simulate(
         if not 0 <= index < len(scene.cameras):
             raise InputError(f"--view {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
     target = out or run / "simulate"
+    pushed = force_from is not None or force_until is not None
+    if force is None and pushed:
+        raise InputError("--force-from and --force-until need --force FX,FY,FZ")
+    if blend is not None and law is None:
+        raise InputError("--blend W needs --law OTHER_RUN, the run whose material is blended in")
+    strength = vector(force, "--force")
     stages.start(settings)
+    from masiv.mpm.simulate import Push
     from masiv.mpm.simulate import simulate as roll
     from masiv.report.film import film
-    from masiv.twin import Twin
 
+    push = None
+    if strength is not None:
+        until = float("inf") if force_until is None else force_until
+        push = Push(strength, 0.0 if force_from is None else force_from, until)
+    twin, look = stages.varied(folder, law=law, blend=blend, geometry=geometry, density=density, ground=ground)
     with progress_bar() as progress:
-        motion = roll(Twin.load(run), frames=frames, fps=scene.fps, progress=progress, **given)
+        motion = roll(twin, frames=frames, fps=scene.fps, push=push, progress=progress, **given)
         target.mkdir(parents=True, exist_ok=True)
         motion.save(target / "rollout.npz")
         if render:
-            film(scene, stages.load_dynamic(folder), motion.positions, views, target, progress=progress)
-    data = {"rollout": str(target / "rollout.npz"), "frames": frames, "particles": motion.positions.shape[1]}
+            seen = replace(scene, ground=scene.ground if ground is None else twin.ground)
+            film(seen, look(), motion.positions, views, target, progress=progress)
+    data = {
+        "rollout": str(target / "rollout.npz"),
+        "frames": frames,
+        "particles": motion.positions.shape[1],
+        "mass_kg": float(twin.density * twin.volume),
+        "law": twin.law.description(),
+    }
     if render:
         data["video"] = str(target / "video.mp4")
     return data, "\n".join(str(data[name]) for name in ("rollout", "video") if name in data)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from masiv import runtime
 from masiv.config import Config, load_config
+from masiv.errors import InputError
 from masiv.progress import Progress
 from masiv.report.history import logged
 from masiv.runfolder import Request, RunFolder
@@ -15,8 +18,11 @@ from masiv.scene.scene import Scene
 from masiv.scene.summary import identity
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from masiv.continuum.trajectory import Trajectory
     from masiv.splat.dynamic import DynamicGaussians
+    from masiv.splat.gaussians import Gaussians
     from masiv.twin import Twin
 
 
@@ -120,6 +126,67 @@ def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress)
         )
         twin.save(run.path)
     return twin
+
+
+def varied(
+    run: RunFolder,
+    *,
+    law: Path | None = None,
+    blend: float | None = None,
+    geometry: Path | None = None,
+    density: float | None = None,
+    ground: str | None = None,
+) -> tuple[Twin, Callable[[], Gaussians]]:
+    """The run's twin with another law, body, density or ground, and what gives the Gaussians to draw it with.
+
+    Raises InputError for a run or a mesh that is not there or cannot be used.
+    """
+    from masiv.materials.blend import blend as between
+    from masiv.mpm import variation
+    from masiv.twin import Twin
+
+    twin = Twin.load(run.path)
+    if law is not None:
+        other = Twin.load(_other(law, "--law"))
+        twin = replace(twin, law=between(twin.law, other.law, 1.0 if blend is None else blend))
+    if density is not None:
+        twin = variation.with_density(twin, density)
+    if geometry is None:
+        return _over(twin, ground), lambda: load_dynamic(run).at(0.0)
+    if geometry.is_dir():
+        source = RunFolder.open(_other(geometry, "--geometry"))
+        twin, shift = variation.with_body_of(twin, Twin.load(source.path))
+        return _over(twin, ground), lambda: _moved(load_dynamic(source).at(0.0), shift)
+    if not geometry.is_file():
+        raise InputError(f"--geometry {geometry} does not exist: give a mesh file or another run's folder")
+    twin = variation.with_mesh(twin, geometry)
+
+    def look() -> Gaussians:
+        from masiv.report.film import balls
+
+        return balls(twin.positions, twin.volume)
+
+    return _over(twin, ground), look
+
+
+def _other(path: Path, flag: str) -> Path:
+    """``path`` where it is a run whose identify stage is done. Raises InputError."""
+    if not (path / "run.yaml").is_file():
+        raise InputError(f"{flag} {path} is not a run folder: give one that masiv identify made")
+    RunFolder.open(path).require("identify")
+    return path
+
+
+def _over(twin: Twin, ground: str | None) -> Twin:
+    from masiv.mpm.variation import with_ground
+
+    return twin if ground is None else with_ground(twin, ground)
+
+
+def _moved(gaussians: Gaussians, shift: np.ndarray) -> Gaussians:
+    import torch
+
+    return replace(gaussians, means=gaussians.means + torch.as_tensor(shift).to(gaussians.means))
 
 
 def start(config: Config) -> None:

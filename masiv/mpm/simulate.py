@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,6 +39,30 @@ class Motion:
         os.replace(temporary, path)
 
 
+@dataclass(frozen=True)
+class Push:
+    """A force (3,) [N, world] on the whole body, spread evenly over its mass, from ``start`` to ``stop`` [s]."""
+
+    force: np.ndarray
+    start: float = 0.0
+    stop: float = math.inf
+
+    def __post_init__(self) -> None:
+        if np.shape(self.force) != (3,) or not np.isfinite(self.force).all():
+            raise InputError("--force takes three finite numbers X,Y,Z [N]")
+        if not (math.isfinite(self.start) and self.start >= 0):
+            raise InputError(f"--force-from {self.start:g}: give a time [s] of 0 or later")
+        if not self.stop > self.start:
+            raise InputError(f"--force-until {self.stop:g} must be later than --force-from {self.start:g}")
+
+    def pieces(self, begin: float, end: float) -> list[tuple[float, bool]]:
+        """The time from ``begin`` to ``end`` [s], cut where the force comes or goes: (duration [s], does it act)."""
+        shortest = 1e-6 * (end - begin)  # a sliver of time is the error of a float, not a piece
+        inside = [t for t in (self.start, self.stop) if begin + shortest < t < end - shortest]
+        cuts = [begin, *inside, end]
+        return [(b - a, self.start < 0.5 * (a + b) < self.stop) for a, b in itertools.pairwise(cuts)]
+
+
 def skew(omega: torch.Tensor) -> torch.Tensor:
     """The matrix W (3, 3) with W r = omega x r."""
     x, y, z = omega.unbind()
@@ -58,14 +85,41 @@ def simulate(
     velocity: np.ndarray | None = None,
     omega: np.ndarray | None = None,
     gravity: np.ndarray | None = None,
+    push: Push | None = None,
     progress: Progress = silent,
 ) -> Motion:
     """The first ``frames`` frames of the twin's motion, frame 0 included.
 
     velocity (3,) [m/s], omega (3,) [rad/s], gravity (3,) [m/s^2], world frame, replace what was identified; fps the
-    video's. Raises InputError for a value that is not finite or a frame count below 1, NonFiniteError where the motion
-    diverges.
+    video's. push: a force for a while. Raises InputError for a value that is not finite, a frame count below 1 or a
+    push that starts after the last frame, NonFiniteError where the motion diverges.
     """
+    rate = twin.fps if fps is None else fps
+    if push is not None and push.start >= (frames - 1) / rate:
+        raise InputError(f"--force-from {push.start:g}: the last frame is at {(frames - 1) / rate:.3g} s")
+    positions = []
+    changes = {"velocity": velocity, "omega": omega, "gravity": gravity}
+    with runtime.torch_threads(1):
+        for frame, state in enumerate(march(twin, frames=frames, fps=rate, push=push, **changes)):
+            positions.append(state.position)
+            if frame:
+                progress("simulate", frame, frames - 1)
+    axes = SimulationFrame.from_scene(twin.up, twin.ground)
+    world = axes.points_to_world(torch.stack(positions).numpy())
+    return Motion(np.asarray(world, dtype=np.float32), np.arange(frames) / rate)
+
+
+def march(
+    twin: Twin,
+    *,
+    frames: int,
+    fps: float,
+    velocity: np.ndarray | None = None,
+    omega: np.ndarray | None = None,
+    gravity: np.ndarray | None = None,
+    push: Push | None = None,
+) -> Iterator[State]:
+    """The state at each frame, in the simulation frame. Arguments and errors as of ``simulate``."""
     chosen = {"velocity": twin.velocity, "omega": twin.omega, "gravity": twin.gravity}
     for name, given in (("velocity", velocity), ("omega", omega), ("gravity", gravity)):
         if given is not None:
@@ -74,43 +128,45 @@ def simulate(
             chosen[name] = np.asarray(given, dtype=np.float64)
     if frames < 1:
         raise InputError(f"--frames {frames}: give at least 1")
-    rate = twin.fps if fps is None else fps
     axes = SimulationFrame.from_scene(twin.up, twin.ground)
     turned = {name: axes.vectors_to_simulation(value) for name, value in chosen.items()}
     tensors = {k: torch.as_tensor(v, dtype=torch.float32) for k, v in turned.items()}
     start = torch.as_tensor(axes.points_to_simulation(twin.positions), dtype=torch.float32)
     state = thrown(start, tensors["velocity"], tensors["omega"])
-    positions = [start]
-    with runtime.torch_threads(1):
-        for frame in range(1, frames):
-            simulator, steps = _for_one_frame(twin, state, turned["gravity"], rate)
-            recording = simulator.run(state, twin.law, steps, [steps])
-            state = recording.final
-            positions.append(recording.positions[0])
-            progress("simulate", frame, frames - 1)
-    world = axes.points_to_world(torch.stack(positions).numpy())
-    return Motion(np.asarray(world, dtype=np.float32), np.arange(frames) / rate)
+    yield state
+    for frame in range(1, frames):
+        pieces = [(1 / fps, False)] if push is None else push.pieces((frame - 1) / fps, frame / fps)
+        for duration, pushed in pieces:
+            acceleration = turned["gravity"]
+            if pushed:
+                acceleration = acceleration + axes.vectors_to_simulation(push.force) / (twin.density * twin.volume)
+            simulator, steps = _for_a_while(twin, state, acceleration, duration)
+            state = simulator.run(state, twin.law, steps, []).final
+        yield state
 
 
-def _for_one_frame(twin: Twin, state: State, gravity: np.ndarray, fps: float) -> tuple[Simulator, int]:
-    """A simulator and its number of substeps for the next frame: as many as the present speed asks for."""
+def _for_a_while(twin: Twin, state: State, acceleration: np.ndarray, duration: float) -> tuple[Simulator, int]:
+    """A simulator and its number of substeps for the next ``duration`` [s]: as many as the present speed asks for.
+
+    acceleration (3,) [m/s^2, simulation frame]: of gravity and of what else acts on all mass alike.
+    """
     spacing = grid_spacing(twin.volume, len(twin.positions), twin.simulator)
-    speed = float(state.velocity.norm(dim=1).max()) + float(np.linalg.norm(gravity)) / fps
+    speed = float(state.velocity.norm(dim=1).max()) + float(np.linalg.norm(acceleration)) * duration
     steps = substeps_per_frame(
         spacing=spacing,
         wave_modulus=twin.law.wave_modulus(),
         density=twin.density,
         speed=speed,
-        frame_time=1 / fps,
+        frame_time=duration,
         config=twin.simulator,
     )
     simulator = Simulator(
         particle_count=len(twin.positions),
         spacing=spacing,
-        substep=1 / (fps * steps),
+        substep=duration / steps,
         volume=twin.volume,
         density=twin.density,
-        gravity=gravity,
+        gravity=acceleration,
         contact=twin.contact if twin.ground is not None else "none",
         friction=twin.friction,
         memory_mb=twin.simulator.memory_mb,

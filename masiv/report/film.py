@@ -15,12 +15,15 @@ from masiv.report.media import write_png, write_video
 from masiv.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.splat.gaussians import Gaussians
+
+LIGHT, DARK = (0.93, 0.62, 0.25), (0.55, 0.30, 0.12)
+"""Colours of the squares on a body that was never seen."""
 
 
 def film(
     scene: Scene,
-    dynamic: DynamicGaussians,
+    gaussians: Gaussians,
     motion: np.ndarray,
     views: Sequence[int],
     out: Path,
@@ -29,22 +32,40 @@ def film(
 ) -> None:
     """Draw ``motion`` (T, Q, 3) [m] into ``out``/views/VIEW_FRAME.png and ``out``/video.mp4, the views side by side.
 
-    The Gaussians of frame 0 are carried by the particles; the ground is drawn as a chequered plane.
+    ``gaussians`` are those of frame 0, carried by the particles; the ground is drawn as a chequered plane.
     """
-    binding = Binding.at_rest(dynamic.at(0.0), motion[0])
+    binding = Binding.at_rest(gaussians, motion[0])
     tile = float(np.ptp(motion[0], axis=0).max()) / 2
     backgrounds = [backdrop(scene.cameras[view], scene.up, scene.ground, tile) for view in views]
     side_by_side = []
     for frame, particles in enumerate(motion):
-        gaussians = binding.moved(particles)
+        now = binding.moved(particles)
         pictures = []
         for view, background in zip(views, backgrounds, strict=True):
-            picture, _ = draw(gaussians, scene.cameras[view], background)
+            picture, _ = draw(now, scene.cameras[view], background)
             write_png(out / "views" / f"{view}_{frame:03d}.png", picture)
             pictures.append(picture)
         side_by_side.append(joined(pictures))
         progress("render", frame + 1, len(motion))
     write_video(out / "video.mp4", side_by_side, scene.fps)
+
+
+def balls(particles: np.ndarray, volume: float) -> Gaussians:
+    """One Gaussian a particle (Q, 3) [m] of a body of ``volume`` [m³] that no camera saw.
+
+    Squares of two colours, so that its turning and stretching show.
+    """
+    import torch
+
+    from masiv.splat.gaussians import Gaussians
+
+    spacing = (volume / len(particles)) ** (1 / 3)
+    low, size = particles.min(0), np.ptp(particles, axis=0).max()
+    even = np.floor((particles - low) / (size / 6)).sum(1) % 2 == 0
+    colours = np.where(even[:, None], LIGHT, DARK)
+    means = torch.as_tensor(particles, dtype=torch.float32)
+    flat = torch.full((len(particles),), 0.5 * spacing)
+    return Gaussians(means, flat, torch.full_like(flat, 0.95), torch.as_tensor(colours, dtype=torch.float32))
 
 
 def joined(pictures: Sequence[np.ndarray]) -> np.ndarray:
