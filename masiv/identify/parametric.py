@@ -17,8 +17,8 @@ from masiv.errors import MasivError, NonFiniteError
 
 FIRST_STEP = 10.0
 """The trust region begins at this many finite-difference steps: as far as a linear model deserves to be believed."""
-TOLERANCE = 1e-3
-"""The fit ends when its steps are this share of a finite-difference step, or the cost falls by less than its square."""
+STEP_TOLERANCE = 1e-3
+"""The fit ends when its steps are this share of a finite-difference step."""
 
 
 @dataclass(frozen=True)
@@ -160,12 +160,14 @@ def fit_parameters(
     *,
     max_evaluations: int,
     robust: bool = False,
+    tolerance: float = 1e-5,
 ) -> Estimate:
     """The values with the least sum of squares of ``residual`` (M,), from ``Parameter.start``, within the bounds.
 
     A NonFiniteError of the residual refuses the step. max_evaluations: calls of the residual in all; at least one
     residual and one Jacobian are taken. robust: least sum of 2 (sqrt(1 + r^2 / s^2) - 1), with s the median size at the
-    start, so that a few wild residuals pull less; the covariance is then that of the reweighted problem.
+    start, so that a few wild residuals pull less; the covariance is then that of the reweighted problem. tolerance: the
+    fit also ends where a step lowers the cost by less than this share.
     Raises NonFiniteError where the start itself diverges, MasivError where the simulation diverges all around a point.
     """
     evaluator = _Evaluator(residual, tuple(parameters), max_evaluations)
@@ -180,7 +182,7 @@ def fit_parameters(
     try:
         result = least_squares(
             evaluator.trial, origin, evaluator.jacobian, (lower, upper), "trf",
-            xtol=TOLERANCE / FIRST_STEP, ftol=TOLERANCE**2, gtol=1e-12,
+            xtol=STEP_TOLERANCE / FIRST_STEP, ftol=tolerance, gtol=None,
             loss="soft_l1" if robust else "linear", f_scale=softness, max_nfev=max(max_evaluations, 1),
         )  # fmt: skip
         u, found = result.x, result.fun
@@ -191,10 +193,10 @@ def fit_parameters(
         evaluator.jacobian(u)
     assert evaluator.jacobian_at is not None
     jacobian = evaluator.jacobian_at[1] / evaluator.scale
-    weight = (1 + (found / softness) ** 2) ** -0.25 if robust else np.ones(len(found))  # root of soft_l1's derivative
+    weight = robust_weight(found, softness) if robust else np.ones(len(found))
     return Estimate(
         evaluator.values(u),
-        _covariance(jacobian * weight[:, None], found * weight),
+        covariance(jacobian * weight[:, None], found * weight),
         jacobian,
         found,
         evaluator.count,
@@ -202,16 +204,21 @@ def fit_parameters(
     )
 
 
-def _covariance(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
+def robust_weight(residual: np.ndarray, softness: float) -> np.ndarray:
+    """Factors that make least squares of the weighted residual (M,) a step of the robust problem."""
+    return (1 + (residual / softness) ** 2) ** -0.25
+
+
+def covariance(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """s^2 (J^T J)^-1, s^2 = |r|^2 / (M - P). A column of zeros has infinite variance; where columns are parallel the
     variances along the free direction are huge, not, as with a pseudo-inverse, nought."""
     size, count = jacobian.shape
     lengths = np.linalg.norm(jacobian, axis=0)
     seen = lengths > 0
-    covariance = np.diag(np.where(seen, 0.0, np.inf))
+    found = np.diag(np.where(seen, 0.0, np.inf))
     if seen.any():
         _, s, vh = np.linalg.svd(jacobian[:, seen] / lengths[seen], full_matrices=False)
         s = np.maximum(s, s[0] * max(size, count) * np.finfo(float).eps)
         inverse = (vh.T / s**2) @ vh / np.outer(lengths[seen], lengths[seen])
-        covariance[np.ix_(seen, seen)] = inverse * float(residual @ residual) / max(size - count, 1)
-    return covariance
+        found[np.ix_(seen, seen)] = inverse * float(residual @ residual) / max(size - count, 1)
+    return found

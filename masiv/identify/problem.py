@@ -36,7 +36,8 @@ class Problem:
     """Rollouts of one body against its observed trajectories.
 
     ``particles`` of the trajectory are used (all where None); targets (F * samples, N, 3) [m] are their positions in
-    the simulation frame at ``samples_per_frame`` instants a frame, the start left out.
+    the simulation frame at ``samples_per_frame`` instants a frame, the start left out. chosen (N,): which particles of
+    the trajectory they are.
     """
 
     def __init__(
@@ -57,9 +58,11 @@ class Problem:
         self.frames = len(trajectory.times) - 1
         instants = np.arange(1, self.frames * self.samples + 1) / (self.samples * scene.fps)
         points = trajectory.evaluate(np.concatenate([[0.0], instants]))
+        self.chosen = np.arange(points.shape[1])
         if particles is not None and particles < points.shape[1]:
             chosen = np.random.default_rng(seed).choice(points.shape[1], particles, replace=False)
-            points = points[:, np.sort(chosen)]
+            self.chosen = np.sort(chosen)
+            points = points[:, self.chosen]
         moved = torch.as_tensor(self.axes.points_to_simulation(points), dtype=torch.float32)
         self.start, self.targets = moved[0].contiguous(), moved[1:]
         self.count = len(self.start)
@@ -83,10 +86,10 @@ class Problem:
         unit = 8 * self.samples
         return -(-count // unit) * unit
 
-    def run(self, law: Law, motion: Motion, contact: str, frames: int) -> torch.Tensor:
-        """Positions (frames * samples, N, 3) [m, simulation frame of the scene], differentiable. Raises
-        NonFiniteError."""
-        steps = self.substeps(law)
+    def run(self, law: Law, motion: Motion, contact: str, frames: int, steps: int | None = None) -> torch.Tensor:
+        """Positions (frames * samples, N, 3) [m, simulation frame of the scene], differentiable. steps: substeps a
+        frame, a multiple of ``samples``; as many as the law needs where None. Raises NonFiniteError."""
+        steps = steps or self.substeps(law)
         simulator = Simulator(
             particle_count=self.count,
             spacing=self.spacing,

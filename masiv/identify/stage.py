@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import numpy as np
 import torch
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.trajectory import Trajectory
+from masiv.identify.baseline import identify_classical
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.fit import fit
+from masiv.identify.found import Found, history_rows
 from masiv.identify.launch import estimate_launch
 from masiv.identify.problem import Motion, Problem
 from masiv.identify.start import Start, choose_start
@@ -32,7 +37,8 @@ def identify(
 ) -> Twin:
     """The twin of what ``trajectory`` (over the frames of ``scene``) shows. Raises MasivError where no law explains it.
 
-    Nothing is assumed of the material: the pretrained law whose rollout is nearest to the motion is only the start.
+    With ``config.law`` neural nothing is assumed of the material: the pretrained law whose rollout is nearest to the
+    motion is only the start. Otherwise the law is a classical one, or an adapter on one.
     """
     with runtime.torch_threads(1):
         return _identify(scene, trajectory, config, simulator, seed, checkpoint or Checkpoint(None), progress)
@@ -57,18 +63,12 @@ def _identify(
         torch.as_tensor(axes.vectors_to_simulation(launch.omega), dtype=torch.float32),
         torch.zeros(()),
     )
-    saved = checkpoint.load() or {}
-    if "start" in saved:
-        start = _start_from(saved["start"])
+    first_frames = min(launch.last_frame + 2, problem.frames)
+    few = functools.partial(Problem, scene, trajectory, config, simulator, particles=config.search_particles, seed=seed)
+    if config.law == "neural":
+        found = _neural(problem, few, motion, first_frames, seed, checkpoint, progress)
     else:
-        few = Problem(scene, trajectory, config, simulator, particles=config.search_particles, seed=seed)
-        start = choose_start(few, motion, progress)[0]
-    keeper = _With(checkpoint, {"start": _start_state(start)})
-    keeper.save({**saved})
-    found = fit(
-        problem, start.law, motion, start.contact, min(launch.last_frame + 2, problem.frames),
-        seed=seed, checkpoint=keeper, progress=progress,
-    )  # fmt: skip
+        found = identify_classical(problem, few(), motion, first_frames, checkpoint, progress)
     ground = scene.ground
     if ground is not None:
         ground = Ground(ground.normal, ground.height + float(found.motion.ground_offset))
@@ -78,7 +78,7 @@ def _identify(
         omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
         gravity=np.asarray(scene.gravity, dtype=np.float64),
         ground=ground,
-        contact=start.contact,
+        contact=found.contact,
         friction=0.0,
         volume=trajectory.volume,
         density=scene.density,
@@ -87,17 +87,38 @@ def _identify(
         law=found.law,
         simulator=simulator,
         fit={
-            "start": start.material,
-            "start_error_mm": 1e3 * start.error,
+            **found.report,
             "trajectory_error_mm": 1e3 * found.error_m,
             "launch_velocity_m_per_s": [float(v) for v in launch.velocity],
             "launch_omega_rad_per_s": [float(v) for v in launch.omega],
             "launch_last_frame": launch.last_frame,
             "frames": scene.frame_count,
-            "history": [{"iteration": i, "frames": k, "trajectory_error_mm": 1e3 * e, "silhouette": s}
-                        for i, k, e, s in found.history],
+            "history": found.history,
         },
-    )  # fmt: skip
+    )
+
+
+def _neural(
+    problem: Problem,
+    few: Callable[[], Problem],
+    motion: Motion,
+    first_frames: int,
+    seed: int,
+    checkpoint: Checkpoint,
+    progress: Progress,
+) -> Found:
+    saved = checkpoint.load() or {}
+    if "start" in saved:
+        start = _start_from(saved["start"])
+    else:
+        start = choose_start(few(), motion, progress)[0]
+    keeper = _With(checkpoint, {"start": _start_state(start)})
+    keeper.save({**saved})
+    fitted = fit(
+        problem, start.law, motion, start.contact, first_frames, seed=seed, checkpoint=keeper, progress=progress
+    )
+    report = {"start": start.material, "start_error_mm": 1e3 * start.error}
+    return Found(fitted.law, fitted.motion, start.contact, fitted.error_m, report, history_rows(fitted))
 
 
 class _With(Checkpoint):

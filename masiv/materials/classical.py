@@ -164,7 +164,7 @@ class ClassicalLaw(Law):
         """An estimated parameter also has ``stderr``, None where the data does not tell it."""
         values: dict[str, dict[str, Any]] = {}
         for name, value in self.values.items():
-            values[name] = {"value": float(value), "unit": UNITS[name]}
+            values[name] = {"value": float(value.detach()), "unit": UNITS[name]}
             if name in self.stderr:
                 values[name]["stderr"] = self.stderr[name] if math.isfinite(self.stderr[name]) else None
         return {"kind": self.kind, "parameters": values}

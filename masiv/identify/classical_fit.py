@@ -1,0 +1,235 @@
+"""Parameters of a classical law, velocity, spin and ground height by least squares through rollouts: the baselines.
+
+Coarse search over the law's scales and the contact, Gauss-Newton on few particles over a growing horizon, then
+chord steps on all particles. No adjoint is needed, so any law will do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from masiv.checkpoint import Checkpoint
+from masiv.errors import MasivError, NonFiniteError
+from masiv.identify.correlation import effective_samples
+from masiv.identify.families import FAMILIES, Family, Rollouts, law_of, mean_distance, motion_of, motion_parameters
+from masiv.identify.parametric import FIRST_STEP, Estimate, Parameter, covariance, fit_parameters, robust_weight
+from masiv.identify.problem import Motion, Problem
+from masiv.materials.classical import ClassicalLaw
+from masiv.progress import Progress
+
+RECONSIDERED = 3
+"""Candidates of the coarse search that are also tried with the other contacts."""
+LEAST_GAIN = 1e-3
+"""A fit goes on while a step lowers the cost by this share."""
+CHORD_STEPS = 4
+
+
+@dataclass
+class FamilyFit:
+    """What a family makes of a motion. values and stderr: law and throw (simulation frame), in each one's unit.
+
+    error_m: mean distance to the trajectories over all frames. mean_square [m^2] and samples: of the residual and how
+    many independent ones it is worth. stage: how far the fit is (0 searched, 1 and 2 fitted on few particles, 3 on
+    all).
+    """
+
+    kind: str
+    contact: str
+    values: dict[str, float]
+    error_m: float = math.inf
+    stderr: dict[str, float] = field(default_factory=dict)
+    mean_square: float = math.inf
+    samples: int = 0
+    rollouts: int = 0
+    stage: int = 0
+
+    @property
+    def law(self) -> ClassicalLaw:
+        law = law_of(FAMILIES[self.kind], self.values)
+        law.stderr = {name: self.stderr[name] for name in law.values if name in self.stderr}
+        return law
+
+    @property
+    def motion(self) -> Motion:
+        return motion_of(self.values)
+
+    def state(self) -> dict[str, Any]:
+        """Plain values, as a checkpoint keeps them."""
+        return asdict(self)
+
+
+def search(problem: Problem, family: Family, motion: Motion, progress: Progress) -> FamilyFit:
+    """The best of ``Family.candidates``, each with the contact that the configuration names, or the best ones with
+    each. Raises MasivError where all diverge."""
+    contacts = ["sticky", "release"] if problem.config.contact == "auto" else [problem.config.contact]
+    if problem.scene.ground is None:
+        contacts = ["none"]
+    throw = {p.name: p.start for p in motion_parameters(problem, motion)}
+    candidates = family.candidates()
+    extra = (len(contacts) - 1) * min(RECONSIDERED, len(candidates))
+    found: list[tuple[float, int, str]] = []
+
+    def tried(index: int, contact: str) -> None:
+        values = {**candidates[index], **throw}
+        try:
+            error = mean_distance(Rollouts(problem, family, contact, problem.frames).field(values))
+        except NonFiniteError:
+            error = math.inf
+        found.append((error, index, contact))
+        note = "diverges" if math.isinf(error) else f"{1e3 * error:.0f} mm"
+        progress(f"identify: {family.kind} search", len(found), len(candidates) + extra, note)
+
+    for index in range(len(candidates)):
+        tried(index, contacts[0])
+    for _, index, _ in sorted(found)[:RECONSIDERED]:
+        for contact in contacts[1:]:
+            tried(index, contact)
+    error, index, contact = min(found)
+    if math.isinf(error):
+        raise MasivError(
+            f"identify: every starting {family.kind} law diverges; check the scene's ground, gravity and units"
+        )
+    return FamilyFit(family.kind, contact, {**candidates[index], **throw}, error, rollouts=len(found))
+
+
+def fit_family(
+    kind: str, few: Problem, motion: Motion, first_frames: int, checkpoint: Checkpoint, progress: Progress
+) -> FamilyFit:
+    """``kind`` fitted on few particles. Goes on from, and saves after each stage to, ``checkpoint`` under its name."""
+    family = FAMILIES[kind].scaled(few.scene.density)
+    saved = (checkpoint.load() or {}).get(kind)
+    if saved is None:
+        found = search(few, family, motion, progress)
+        _keep(checkpoint, found)
+    else:
+        found = FamilyFit(**saved)
+    middle = min(few.frames, max(first_frames, (few.frames + 1) // 2))
+    for stage, frames in ((1, middle), (2, few.frames)):
+        if found.stage >= stage:
+            continue
+        label = f"identify: {kind} fit, {frames} frames"
+        found = _stage(few, family, found, frames, stage, label, progress)
+        _keep(checkpoint, found)
+    return found
+
+
+def _keep(checkpoint: Checkpoint, found: FamilyFit) -> None:
+    checkpoint.save({**(checkpoint.load() or {}), found.kind: found.state()})
+
+
+def _stage(
+    problem: Problem, family: Family, found: FamilyFit, frames: int, stage: int, label: str, progress: Progress
+) -> FamilyFit:
+    """Gauss-Newton over ``frames`` from what was found."""
+    rollouts = Rollouts(problem, family, found.contact, frames)
+    budget, done = problem.config.family_rollouts, 0
+
+    def residual(values: dict[str, float]) -> np.ndarray:
+        nonlocal done
+        done += 1
+        here = rollouts.field(values)
+        progress(label, min(done, budget), budget, f"{1e3 * mean_distance(here):.1f} mm")
+        return here.ravel()
+
+    parameters = _parameters(problem, family, found)
+    estimate = fit_parameters(residual, parameters, max_evaluations=budget, robust=True, tolerance=LEAST_GAIN)
+    shape = (frames * problem.samples, problem.count, 3)
+    found = _updated(problem, found, estimate, estimate.residual.reshape(shape), stage)
+    progress(label, budget, budget, f"{1e3 * found.error_m:.1f} mm")
+    return found
+
+
+def fit_all_particles(
+    found: FamilyFit, few: Problem, problem: Problem, checkpoint: Checkpoint, progress: Progress
+) -> FamilyFit:
+    """Chord steps: the Jacobian of few particles on the residual of the same particles in rollouts of all of them.
+
+    A finer body is a little stiffer and loses less to the grid, which moves the residual more than its derivative.
+    """
+    if found.stage >= 3:
+        return found
+    label = f"identify: {found.kind} fit, all particles"
+    total = CHORD_STEPS + 2
+    family = FAMILIES[found.kind].scaled(few.scene.density)
+    parameters = _parameters(few, family, found)
+    progress(label, 0, total)
+    coarse = fit_parameters(
+        Rollouts(few, family, found.contact, few.frames), parameters, max_evaluations=1, robust=True
+    )
+    progress(label, 1, total)
+    rollouts = Rollouts(problem, family, found.contact, problem.frames)
+    softness = max(1.4826 * float(np.median(np.abs(coarse.residual))), 1e-12)
+    values, jacobian, scale = found.values, coarse.jacobian, 1.0
+    best = rollouts.field(values)
+    residual = best[:, few.chosen].ravel()
+    progress(label, 2, total, f"{1e3 * mean_distance(best):.1f} mm")
+    for step in range(CHORD_STEPS):
+        weight = robust_weight(residual, softness)
+        full = np.linalg.lstsq(jacobian * weight[:, None], -residual * weight, rcond=None)[0]
+        moved = _moved(parameters, values, scale * full)
+        try:
+            field = rollouts.field(moved)
+            tried = field[:, few.chosen].ravel()
+            cost, before = (np.sqrt(1 + (r / softness) ** 2).sum() - len(r) for r in (tried, residual))
+        except NonFiniteError:
+            cost, before = math.inf, 1.0
+        if cost < before:
+            values, residual, best = moved, tried, field
+            if cost > (1 - LEAST_GAIN) * before:
+                break
+        else:
+            scale *= 0.5
+        progress(label, 3 + step, total, f"{1e3 * mean_distance(best):.1f} mm")
+    weight = robust_weight(residual, softness)
+    spread = covariance(jacobian * weight[:, None], residual * weight)
+    estimate = Estimate(values, spread, jacobian, residual, coarse.evaluations + CHORD_STEPS + 1, tuple(parameters))
+    found = _updated(few, found, estimate, residual.reshape(-1, few.count, 3), 3)
+    found.error_m = mean_distance(best)
+    _keep(checkpoint, found)
+    progress(label, total, total, f"{1e3 * found.error_m:.1f} mm")
+    return found
+
+
+def _moved(parameters: list[Parameter], values: dict[str, float], step: np.ndarray) -> dict[str, float]:
+    """``values`` after a step in the fitted scales, no longer than a linear model deserves, within the bounds."""
+    out = {}
+    for p, delta in zip(parameters, step, strict=True):
+        limit = FIRST_STEP * p.step
+        out[p.name] = p.value(p.fitted(values[p.name]) + float(np.clip(delta, -limit, limit)))
+    return out
+
+
+def best_family(fits: list[FamilyFit]) -> FamilyFit:
+    """The family with the least Bayesian information criterion: of two that explain as much, the one with fewer
+    parameters. Residuals are worth as many samples as the best family's."""
+    samples = min(fits, key=lambda f: f.mean_square).samples
+    return min(fits, key=lambda f: information_criterion(f, samples))
+
+
+def information_criterion(found: FamilyFit, samples: int) -> float:
+    """BIC of normal residuals, n ln(mean square) + k ln(n); only differences count."""
+    return samples * math.log(max(found.mean_square, 1e-300)) + len(found.values) * math.log(max(samples, 1))
+
+
+def _parameters(problem: Problem, family: Family, found: FamilyFit) -> list[Parameter]:
+    motion = motion_parameters(problem, found.motion)
+    both = [*family.parameters, *motion]
+    return [replace(p, start=float(np.clip(found.values[p.name], p.lower, p.upper))) for p in both]
+
+
+def _updated(problem: Problem, found: FamilyFit, estimate: Estimate, residual: np.ndarray, stage: int) -> FamilyFit:
+    samples = effective_samples(residual, problem.start.double().numpy())
+    return replace(
+        found,
+        values=estimate.values,
+        stderr=estimate.stderr(samples),
+        error_m=mean_distance(residual),
+        mean_square=float((residual**2).mean()),
+        samples=samples,
+        rollouts=found.rollouts + estimate.evaluations,
+        stage=stage,
+    )
