@@ -22,6 +22,15 @@ from .options import (
 def identify(
     scene: SceneArgument,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder. [default: runs/SCENE]")] = None,
+    law: Annotated[
+        str | None,
+        typer.Option(
+            "--law",
+            help="What is fitted: neural, adapter (a correction of a classical law), neo_hookean, newtonian, "
+            "non_newtonian, von_mises, drucker_prager, or auto (the classical law that explains the motion best). "
+            "[default: neural]",
+        ),
+    ] = None,
     fit_frames: FitFramesOption = None,
     holdout: HoldoutOption = None,
     config: ConfigOption = None,
@@ -33,6 +42,8 @@ def identify(
     """From video to twin: runs every stage that the run folder lacks, then writes rollout, numbers and a report.
 
     Example: `masiv identify scenes/bunny --out runs/bunny --preset quick --fit-frames 12`
+
+    A classical baseline: `masiv identify scenes/bunny --out runs/bunny-elastic --law neo_hookean`
     """
     from . import stages
     from .console import progress_bar
@@ -46,6 +57,7 @@ def identify(
         arch=arch,
         fit_frames=fit_frames,
         holdout=holdout,
+        law=law,
     )
     stages.start(settings)
     from masiv.mpm.simulate import simulate
@@ -64,5 +76,27 @@ def identify(
         progress("report", 0, 1)
         write_report(run, read, dynamic, trajectory, twin, motion.positions, numbers)
         progress("report", 1, 1)
-    data = {"run": str(run.path), "report": str(run.report), "metrics": numbers}
-    return data, f"{table(numbers)}\nreport   {run.report}"
+    described = twin.law.description()
+    data = {"run": str(run.path), "report": str(run.report), "law": described, "metrics": numbers}
+    families = twin.fit.get("families", [])
+    if families:
+        data["families"] = families
+    return data, f"{table(numbers)}\n{_law_text(described, families)}report   {run.report}"
+
+
+def _law_text(described: dict[str, Any], families: list[dict[str, Any]]) -> str:
+    """The parameters of a law with their standard errors, and how well each family did where several were fitted."""
+    lines = [f"law      {described['kind']}"]
+    for name, entry in described["parameters"].items():
+        line = f"         {name.replace('_', ' ')} {entry['value']:.4g} {entry['unit']}"
+        if "stderr" in entry:
+            known = entry["stderr"] is not None
+            line += f" ± {entry['stderr']:.2g}" if known else " (the motion does not tell it)"
+        lines.append(line)
+    for row in families:
+        if "failed" in row:
+            lines.append(f"         {row['law']}: failed, {row['failed']}")
+        else:
+            criterion = f"BIC {row['bic_above_best']:.0f} above the best"
+            lines.append(f"         {row['law']}: {row['trajectory_error_mm']:.1f} mm, {criterion}")
+    return "\n".join(lines) + "\n"

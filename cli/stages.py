@@ -36,13 +36,15 @@ def open_run(
     arch: str | None = None,
     fit_frames: int | None = None,
     holdout: list[int] | None = None,
+    law: str | None = None,
 ) -> tuple[RunFolder, Config, Scene]:
     """The run in ``out``, new or resumed, its configuration and the whole scene. What is not given is as in the run.
 
     Everything is checked before the folder is made. Raises InputError.
     """
     existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
-    settings = load_config(preset, config, existing.config if existing else None, seed=seed, arch=arch)
+    flags: dict[str, int | str | None] = {"seed": seed, "arch": arch, "identify.law": law}
+    settings = load_config(preset, config, existing.config if existing else None, **flags)
     scene = read_scene(scene_path)
     if fit_frames is None:
         fit_frames = existing.fit_frames if existing else scene.fit_frames or scene.frame_count

@@ -40,7 +40,7 @@ def load_config(
     base: Mapping[str, Any] | None = None,
     **flags: int | str | None,
 ) -> Config:
-    """The configuration from a preset, a YAML file and flags (None: not given).
+    """The configuration from a preset, a YAML file and flags (None: not given); flag "identify.law" is a nested key.
 
     ``base`` is the configuration of an existing run. It takes the place of the defaults; under a preset that
     is given, only its seed and arch do.
@@ -55,7 +55,13 @@ def load_config(
     merged = _merged(merged, from_file)
     if preset is not None:
         merged["preset"] = preset
-    merged |= {key: value for key, value in flags.items() if value is not None}
+    for key, value in flags.items():
+        if value is not None:
+            *sections, name = key.split(".")
+            nested: dict[str, Any] = {name: value}
+            for section in reversed(sections):
+                nested = {section: nested}
+            merged = _merged(merged, nested)
     return validated(Config, merged, "the command line" if path is None else str(path))
 
 
