@@ -33,7 +33,7 @@ def inspect(
     load_config(preset, config, seed=seed, arch=arch)
     read = read_scene(scene)
     summary = summarise(read)
-    target = out or Path(f"{scene.resolve().name}_inspect.png")
+    target = out or Path(f"{scene.resolve().stem if scene.is_file() else scene.resolve().name}_inspect.png")
     write_contact_sheet(read, target)
     summary["picture"] = str(target)
     return summary, as_text(summary)

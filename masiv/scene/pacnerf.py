@@ -6,30 +6,27 @@ frame −1 the empty background, frame −2 an occluder. World: metres, y up, gr
 
 from __future__ import annotations
 
-import json
 import re
-import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 
 from masiv.errors import InputError
-from masiv.scene import masks
+from masiv.scene.assemble import Conventions, assemble
 from masiv.scene.camera import Camera
 from masiv.scene.declaration import SceneDeclaration
-from masiv.scene.scene import Frame, Scene
-from masiv.scene.transforms import frame_of_time, opengl_c2w_to_world_to_camera
+from masiv.scene.listing import entries as listed_entries
+from masiv.scene.listing import read_json
+from masiv.scene.pictures import PLAIN, MaskSource, Pictures, common_size
+from masiv.scene.scene import Scene
+from masiv.scene.transforms import frame_of_time, opengl_c2w_to_world_to_camera, whole_if_near
 
 LOOKED_FOR = "all_data.json or all_data_full.json"
 NAMES = ("all_data_full.json", "all_data.json")
 PICTURE = re.compile(r"^(?P<prefix>.*?)(?P<view>\d+)_(?P<frame>-?\d+)\.(png|jpg|jpeg)$", re.IGNORECASE)
 BACKGROUND, OCCLUDER = -1, -2
-OCCLUDER_ALPHA = 50
-DENSITY = 1000.0
-GRAVITY = 9.8
+CONVENTIONS = Conventions(up="y", ground_height=0.0)
 
 
 @dataclass(frozen=True)
@@ -58,45 +55,21 @@ def read(folder: Path, declaration: SceneDeclaration) -> Scene:
     frame_count = _frame_count(observed, listing)
     fps = declaration.fps or _fps(observed, listing)
     present = [e for e in observed if e.path.is_file() and e.path.stat().st_size > 0]
-    problems = _missing(view_ids, frame_count, present, listing)
     cameras = tuple(_camera(view, observed, present, listing) for view in view_ids)
-    up = declaration.up("y")
-    corners = declaration.crop_corners()
-    reader = _Pictures(
-        paths={(view_ids.index(e.view), e.frame): e.path for e in present},
+    backgrounds = _special(entries, folder, view_ids, BACKGROUND)
+    paths = {(view_ids.index(e.view), e.frame): e.path for e in present}
+    pictures = Pictures(
+        paths=paths,
+        masks={key: _mask_source(path, key[0] in backgrounds) for key, path in paths.items()},
         cameras=cameras,
-        backgrounds=_special(entries, folder, view_ids, BACKGROUND),
+        backgrounds=backgrounds,
         occluders=_special(entries, folder, view_ids, OCCLUDER),
-        crops=None if corners is None else tuple(_crop(camera, corners) for camera in cameras),
     )
-    source, more = reader.mask_sources()
-    if declaration.fit_frames is not None and declaration.fit_frames > frame_count:
-        raise InputError(f"scene.yaml: fit_frames is {declaration.fit_frames}, the scene has {frame_count} frames")
-    return Scene(
-        path=folder,
-        layout="pacnerf",
-        fps=fps,
-        frame_count=frame_count,
-        cameras=cameras,
-        gravity=declaration.gravity_vector(up, GRAVITY),
-        up=up,
-        ground=declaration.ground_plane(up, 0.0),
-        density=declaration.density or DENSITY,
-        load=reader.load,
-        mask_source=source,
-        background=reader.background,
-        problems=(*problems, *more),
-        fit_frames=declaration.fit_frames,
-    )
+    return assemble(folder, "pacnerf", declaration, CONVENTIONS, pictures, fps=fps, frame_count=frame_count)
 
 
 def _entries(folder: Path, listing: Path) -> list[_Entry]:
-    try:
-        rows: Any = json.loads(listing.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{listing} is not valid JSON: {error}") from error
-    if not isinstance(rows, list) or not rows:
-        raise InputError(f"{listing} must be a list with one entry a picture")
+    rows = listed_entries(read_json(listing), str(listing), "picture")
     entries: dict[tuple[int, int], _Entry] = {}
     for number, row in enumerate(rows):
         where = f"{listing}, entry {number}"
@@ -140,8 +113,7 @@ def _fps(observed: list[_Entry], listing: Path) -> float:
     first, last = min(observed, key=lambda e: e.frame), max(observed, key=lambda e: e.frame)
     if last.time <= first.time:
         raise InputError(f"{listing}: time does not increase with the frame; fix it or give fps in scene.yaml")
-    fps = (last.frame - first.frame) / (last.time - first.time)
-    fps = float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else fps
+    fps = whole_if_near((last.frame - first.frame) / (last.time - first.time))
     for entry in observed:
         steps = (entry.time - first.time) * fps
         if frame_of_time(entry.time - first.time, fps) != entry.frame - first.frame or abs(steps - round(steps)) > 0.25:
@@ -150,23 +122,6 @@ def _fps(observed: list[_Entry], listing: Path) -> float:
                 f"at {fps:g} fps; fix the times or give fps in scene.yaml"
             )
     return fps
-
-
-def _missing(view_ids: list[int], frame_count: int, present: list[_Entry], listing: Path) -> list[str]:
-    have = {(e.view, e.frame) for e in present}
-    problems = []
-    for view in view_ids:
-        gaps = [f for f in range(frame_count) if (view, f) not in have]
-        if len(gaps) == frame_count:
-            raise InputError(
-                f"{listing.parent} has none of the pictures of view {view}: remove the view from the listing"
-            )
-        if gaps:
-            problems.append(f"view {view} has no picture at frame {', '.join(map(str, gaps))}: treated as not visible")
-    for frame in range(frame_count):
-        if not any((view, frame) in have for view in view_ids):
-            raise InputError(f"{listing.parent} has no picture of any view at frame {frame}")
-    return problems
 
 
 def _camera(view: int, observed: list[_Entry], present: list[_Entry], listing: Path) -> Camera:
@@ -178,22 +133,11 @@ def _camera(view: int, observed: list[_Entry], present: list[_Entry], listing: P
             raise InputError(
                 f"{listing}: the camera of view {view} moves between {first.path.name} and {entry.path.name}"
             )
-    sizes = {_size(e.path): e.path for e in present if e.view == view}
-    if len(sizes) > 1:
-        listed = ", ".join(f"{path.name} {w}×{h}" for (w, h), path in sizes.items())
-        raise InputError(f"pictures of view {view} in {listing.parent} differ in size: {listed}")
-    width, height = next(iter(sizes))
+    seen = [e.path for e in present if e.view == view]
+    if not seen:
+        raise InputError(f"{listing.parent} has none of the pictures of view {view}: remove the view from the listing")
+    width, height = common_size(seen, f"view {view} in {listing.parent}")
     return Camera(f"view {view}", width, height, first.intrinsics, first.world_to_camera)
-
-
-def _size(path: Path) -> tuple[int, int]:
-    """Width and height, from the header where the file is a PNG."""
-    with path.open("rb") as file:
-        head = file.read(24)
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
-        return struct.unpack(">II", head[16:24])
-    height, width = _pixels(path).shape[:2]
-    return width, height
 
 
 def _special(entries: list[_Entry], folder: Path, view_ids: list[int], frame: int) -> dict[int, Path]:
@@ -203,98 +147,12 @@ def _special(entries: list[_Entry], folder: Path, view_ids: list[int], frame: in
     return {i: path for i, path in paths.items() if path.is_file()}
 
 
-def _crop(camera: Camera, corners: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool that the crop box covers; all of them for a box that reaches behind the camera."""
-    pixels, depth = camera.project(corners)
-    if depth.min() <= 1e-6:
-        return np.ones((camera.height, camera.width), bool)
-    hull = cv2.convexHull(np.clip(pixels, -1e6, 1e6).astype(np.int32))
-    return cv2.fillConvexPoly(np.zeros((camera.height, camera.width), np.uint8), hull, 1).astype(bool)
-
-
-def _pixels(path: Path) -> np.ndarray:
-    """(H, W, 3) RGB or (H, W, 4) RGBA, uint8."""
-    decoded = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if decoded is None:
-        raise InputError(f"{path} cannot be read as a picture: replace it or remove it from the listing")
-    raw = np.asarray(decoded)
-    if raw.dtype == np.uint16:
-        raw = (raw // 256).astype(np.uint8)
-    if raw.ndim == 2:
-        return np.repeat(raw[..., None], 3, axis=-1)
-    return np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[-1]]])
-
-
-@dataclass(frozen=True)
-class _Pictures:
-    """Reads pictures and masks. Keys of ``paths`` are (camera index, frame); of the others, camera indices."""
-
-    paths: dict[tuple[int, int], Path]
-    cameras: tuple[Camera, ...]
-    backgrounds: dict[int, Path]
-    occluders: dict[int, Path]
-    crops: tuple[np.ndarray, ...] | None
-
-    def load(self, view: int, frame: int) -> Frame:
-        camera = self.cameras[view]
-        shape = camera.height, camera.width
-        path = self.paths.get((view, frame))
-        if path is None:  # listed in Scene.problems: nothing was seen
-            return Frame(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32), np.zeros(shape, bool))
-        image = self._read(path, shape)
-        mask = self._mask(view, path, image)
-        valid = np.ones(shape, bool)
-        if view in self.occluders:
-            occluder = self._read(self.occluders[view], shape)
-            if occluder.shape[-1] == 4:
-                valid = occluder[..., 3] <= OCCLUDER_ALPHA
-        if self.crops is not None:
-            mask = mask * self.crops[view]
-        return Frame(image[..., :3], mask, valid)
-
-    def background(self, view: int) -> np.ndarray | None:
-        """The empty scene in ``view``, (H, W, 3) uint8, where there is a picture of it."""
-        if view not in self.backgrounds:
-            return None
-        camera = self.cameras[view]
-        return self._read(self.backgrounds[view], (camera.height, camera.width))[..., :3]
-
-    def mask_sources(self) -> tuple[str, list[str]]:
-        """The main source of the masks, in words, and a problem for each picture set that has another one."""
-        kinds: dict[str, list[str]] = {}
-        for (view, _), path in self.paths.items():
-            kinds.setdefault(self._source(view, path), []).append(path.name)
-        main, *others = sorted(kinds, key=lambda kind: -len(kinds[kind]))
-        problems = [f"{len(kinds[o])} pictures ({kinds[o][0]}, …) take their mask from {o}" for o in others]
-        if any(self._read(p, None).shape[-1] != 4 for p in self.occluders.values()):
-            problems.append("the occluder pictures (frame −2) have no alpha channel and are ignored")
-        return main, problems
-
-    def _source(self, view: int, path: Path) -> str:
-        if _beside(path, "a").is_file():
-            return "alpha pictures a_V_F.png"
-        if _beside(path, "m").is_file():
-            return "cut-outs on white m_V_F.png"
-        return "difference from the background frame −1" if view in self.backgrounds else "plain background"
-
-    def _mask(self, view: int, path: Path, image: np.ndarray) -> np.ndarray:
-        shape = image.shape[:2]
-        alpha, cutout = _beside(path, "a"), _beside(path, "m")
-        if alpha.is_file():
-            pixels = self._read(alpha, shape)
-            return pixels[..., 3 if pixels.shape[-1] == 4 else 0].astype(np.float32) / 255
-        if cutout.is_file():
-            return masks.from_white(self._read(cutout, shape)[..., :3], image[..., :3])
-        if view in self.backgrounds:
-            return masks.from_background(image[..., :3], self._read(self.backgrounds[view], shape)[..., :3])
-        return masks.from_plain_background(image[..., :3])
-
-    def _read(self, path: Path, shape: tuple[int, int] | None) -> np.ndarray:
-        pixels = _pixels(path)
-        if shape is not None and pixels.shape[:2] != tuple(shape):
-            h, w = pixels.shape[:2]
-            raise InputError(f"{path} is {w}×{h}, the other pictures of its view are {shape[1]}×{shape[0]}")
-        return pixels
+def _mask_source(path: Path, has_background: bool) -> MaskSource:
+    if (alpha := _beside(path, "a")).is_file():
+        return MaskSource("alpha", "alpha pictures a_V_F.png", alpha)
+    if (cutout := _beside(path, "m")).is_file():
+        return MaskSource("cutout", "cut-outs on white m_V_F.png", cutout)
+    return MaskSource("background", "difference from the background frame −1") if has_background else PLAIN
 
 
 def _beside(path: Path, kind: str) -> Path:

@@ -2,30 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 from masiv.errors import InputError
-from masiv.scene import pacnerf
+from masiv.scene import blender, nerfstudio, pacnerf, springgaus_real, springgaus_synthetic
 from masiv.scene.declaration import SceneDeclaration, read_declaration
 from masiv.scene.scene import Scene
 
-# layout -> (the files that tell it, test, reader)
-LAYOUTS: dict[str, tuple[str, Callable[[Path], bool], Callable[[Path, SceneDeclaration], Scene]]] = {
-    "pacnerf": (pacnerf.LOOKED_FOR, pacnerf.recognises, pacnerf.read),
+
+class Layout(Protocol):
+    """A module that reads one layout. ``LOOKED_FOR`` says by which files it is known."""
+
+    @property
+    def LOOKED_FOR(self) -> str: ...
+
+    def recognises(self, folder: Path, /) -> bool: ...
+
+    def read(self, folder: Path, declaration: SceneDeclaration, /) -> Scene: ...
+
+
+LAYOUTS: dict[str, Layout] = {
+    "PAC-NeRF": pacnerf,
+    "Spring-Gaus synthetic": springgaus_synthetic,
+    "Spring-Gaus real": springgaus_real,
+    "nerfstudio": nerfstudio,
+    "Blender": blender,
 }
 
 
 def read_scene(path: str | Path) -> Scene:
-    """Read the scene in folder ``path``, whatever its layout, with the ``scene.yaml`` beside it.
+    """Read the scene at ``path``, whatever its layout, with the ``scene.yaml`` beside it.
 
     Raises InputError where nothing is recognised or what is there cannot be used; lesser troubles are in ``problems``.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        raise InputError(f"{folder} is not a folder: give the folder of a scene")
-    for _, recognises, read in LAYOUTS.values():
-        if recognises(folder):
-            return read(folder, read_declaration(folder))
-    looked = "; ".join(f"{files} ({name})" for name, (files, _, _) in LAYOUTS.items())
-    raise InputError(f"{folder} has no known scene layout: looked for {looked}")
+    path = Path(path)
+    is_sequence = path.is_file() and springgaus_real.recognises(path)
+    if not path.is_dir() and not is_sequence:
+        raise InputError(f"{path} is not a folder: give the folder of a scene")
+    for layout in LAYOUTS.values():
+        if layout.recognises(path):
+            return layout.read(path, read_declaration(path.parent if is_sequence else path))
+    looked = "; ".join(f"{layout.LOOKED_FOR} ({name})" for name, layout in LAYOUTS.items())
+    raise InputError(f"{path} has no known scene layout: looked for {looked}")

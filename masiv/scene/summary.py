@@ -41,16 +41,20 @@ def summarise(scene: Scene) -> dict[str, Any]:
     """Everything that ``masiv inspect`` says. Reads every picture; those that show nothing become problems."""
     problems = list(scene.problems)
     coverage = np.zeros((len(scene.views), scene.frame_count))
+    seen = np.zeros(coverage.shape, bool)
     for row, view in enumerate(scene.views):
         for frame in range(scene.frame_count):
             picture = scene.frame(view, frame)
+            seen[row, frame] = picture.valid.any()
             coverage[row, frame] = picture.mask.mean()
-            if picture.valid.any() and coverage[row, frame] == 0:
+            if seen[row, frame] and coverage[row, frame] == 0:
                 problems.append(f"view {view} at frame {frame}: the mask is empty")
             elif coverage[row, frame] > 0.6:
                 problems.append(
                     f"view {view} at frame {frame}: the mask covers {coverage[row, frame]:.0%} of the picture"
                 )
+    pictures = dict(zip(scene.views, seen.sum(axis=1).tolist(), strict=True))
+    coverage = coverage[seen] if seen.any() else coverage
     return {
         "scene": str(scene.path),
         **identity(scene),
@@ -65,8 +69,9 @@ def summarise(scene: Scene) -> dict[str, Any]:
                 "focal_px": [float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])],
                 "principal_point_px": [float(camera.intrinsics[0, 2]), float(camera.intrinsics[1, 2])],
                 "position_m": camera.centre.tolist(),
+                "frames": pictures.get(view, 0),
             }
-            for camera in scene.cameras
+            for view, camera in enumerate(scene.cameras)
         ],
         "problems": problems,
     }
@@ -94,6 +99,7 @@ def as_text(summary: dict[str, Any]) -> str:
     lines += [
         f"  {index:2d} {camera['name']:10s} {camera['width_px']}×{camera['height_px']}"
         f"  focal {camera['focal_px'][0]:.1f} px  at {numbers(camera['position_m'])} m"
+        + ("" if camera["frames"] == summary["frames"] else f"  {camera['frames']} of {summary['frames']} frames")
         for index, camera in enumerate(summary["cameras"])
     ]
     lines += ["problems " + ("none" if not summary["problems"] else "")]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from masiv.errors import InputError
@@ -32,6 +34,79 @@ def opengl_c2w_to_world_to_camera(camera_to_world: np.ndarray) -> np.ndarray:
     inverse[:3, :3] = rotation.T
     inverse[:3, 3] = -rotation.T @ pose[:3, 3]
     return OPENGL_TO_OPENCV @ inverse
+
+
+def rotation_vector_to_world_to_camera(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """OpenCV's extrinsics, rotation vector (3,) [rad] and translation (3,) [m] -> world_to_camera (4, 4) [m]."""
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = cv2.Rodrigues(np.asarray(rotation, np.float64).reshape(3))[0]
+    world_to_camera[:3, 3] = np.asarray(translation, np.float64).reshape(3)
+    return world_to_camera
+
+
+@dataclass(frozen=True)
+class TimeGrid:
+    """Frames at even times: frame k is at ``first + k step`` [in the unit of the times that made it].
+
+    ``fps``: frames per second. ``tolerance``: how far a time may be from its frame, in frames.
+    """
+
+    first: float
+    step: float
+    count: int
+    fps: float
+    tolerance: float
+
+    def frame(self, time: float) -> int | None:
+        """The frame at ``time``, or None where it is between two frames or outside."""
+        position = (time - self.first) / self.step
+        k = round(position)
+        return k if 0 <= k < self.count and abs(position - k) <= self.tolerance else None
+
+    @classmethod
+    def of_times(cls, times: Sequence[float], names: Sequence[str], fps: float | None = None) -> TimeGrid:
+        """The grid that all ``times`` [s] lie on; ``names`` are those of the pictures, for messages.
+
+        Even within 1 % of a frame. A declared ``fps`` decides how long a frame lasts, whatever the unit of the times,
+        which may then be rounded (25 %). Raises InputError, naming a picture, for times that are not even.
+        """
+        order = np.argsort(times, kind="stable")
+        ordered = np.asarray(times, np.float64)[order]
+        gaps: np.ndarray = np.diff(ordered)
+        if not len(gaps) or gaps.max() <= 0:
+            raise InputError(f"{names[0]}: all pictures have the same time, a motion needs two or more")
+        # Pictures of one instant may differ by jitter: a new instant begins after a gap.
+        starts: np.ndarray = np.concatenate([[0], 1 + np.flatnonzero(gaps > 0.025 * gaps.max())]).astype(int)
+        instants = np.array([np.median(group) for group in np.split(ordered, starts[1:])])
+        spacing: np.ndarray = np.diff(instants)
+        usual = np.median(spacing)
+        index = np.concatenate([[0], np.cumsum(np.maximum(np.round(spacing / usual), 1))]).astype(int)
+        step = (instants[-1] - instants[0]) / index[-1]
+        of_each = np.repeat(index, np.diff(np.append(starts, len(ordered))))
+        tolerance = 0.01 if fps is None else 0.25
+        first = instants[0]
+        away = np.abs((ordered - first) / step - of_each)
+        if away.max() > tolerance:
+            uneven = np.abs(spacing / usual - 1)
+            worst = starts[1 + int(uneven.argmax())] if uneven.max() > tolerance else int(away.argmax())
+            raise InputError(
+                f"{names[order[worst]]} has time {ordered[worst]:g}, {ordered[worst] - ordered[worst - 1]:g} after the "
+                f"time before it, where {usual:g} is usual: times must be even within {tolerance:.0%} of a frame; "
+                "correct them" + ("" if fps else ", or give fps in scene.yaml if they are only rounded")
+            )
+        if index[-1] >= len(instants):
+            gap = int(np.flatnonzero(np.diff(index) > 1)[0])
+            raise InputError(
+                f"no view has a picture at frame {index[gap] + 1}, between {names[order[starts[gap]]]} and "
+                f"{names[order[starts[gap + 1]]]}: frames must run without gaps"
+            )
+        rate = fps or whole_if_near(1 / step)
+        return cls(float(first), float(step), len(instants), float(rate), tolerance)
+
+
+def whole_if_near(fps: float) -> float:
+    """``fps``, as a whole number where that agrees to 0.1 %: times are written with few digits."""
+    return float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else float(fps)
 
 
 def frame_of_time(time: float, fps: float) -> int:

@@ -1,0 +1,117 @@
+"""From what a reader found to a ``Scene``: conventions, what scene.yaml says, gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from masiv.errors import InputError
+from masiv.scene.declaration import SceneDeclaration
+from masiv.scene.pictures import Pictures, crop
+from masiv.scene.scene import Scene
+
+LISTED = 8
+
+
+@dataclass(frozen=True)
+class Conventions:
+    """What a layout takes for granted and scene.yaml may change.
+
+    up: axis. ground_height: of the plane across it [m], None where the layout says nothing of a ground. gravity [m/s²]
+    along −up, density [kg/m³]. up_assumed: nothing in the files says it. Guesses are said in ``problems`` unless
+    scene.yaml settles them.
+    """
+
+    up: str
+    ground_height: float | None
+    gravity: float = 9.8
+    density: float = 1000.0
+    up_assumed: bool = False
+
+
+def assemble(
+    folder: Path,
+    layout: str,
+    declaration: SceneDeclaration,
+    conventions: Conventions,
+    pictures: Pictures,
+    *,
+    fps: float,
+    frame_count: int,
+    problems: Iterable[str] = (),
+) -> Scene:
+    """The scene. Raises InputError for a frame or a camera without a picture and for a scene.yaml that does not fit."""
+    cameras = pictures.cameras
+    if declaration.fit_frames is not None and declaration.fit_frames > frame_count:
+        raise InputError(f"scene.yaml: fit_frames is {declaration.fit_frames}, the scene has {frame_count} frames")
+    gaps = _gaps(folder, pictures, frame_count)
+    up = declaration.up(conventions.up)
+    corners = declaration.crop_corners()
+    if corners is not None:
+        pictures = replace(pictures, crops=tuple(crop(camera, corners) for camera in cameras))
+    source, more = pictures.mask_sources()
+    return Scene(
+        path=folder,
+        layout=layout,
+        fps=fps,
+        frame_count=frame_count,
+        cameras=cameras,
+        gravity=declaration.gravity_vector(up, conventions.gravity),
+        up=up,
+        ground=declaration.ground_plane(up, conventions.ground_height),
+        density=declaration.density or conventions.density,
+        load=pictures.load,
+        mask_source=source,
+        background=pictures.background,
+        problems=(*problems, *_guesses(declaration, conventions), *gaps, *more),
+        fit_frames=declaration.fit_frames,
+    )
+
+
+def _guesses(declaration: SceneDeclaration, conventions: Conventions) -> list[str]:
+    guesses = []
+    if conventions.up_assumed and declaration.up_axis is None:
+        guesses.append(f"the layout does not say which way is up: +{conventions.up} is taken, as is usual in it")
+    if conventions.ground_height is None and declaration.ground is None:
+        guesses.append(
+            "the layout says nothing of a ground: none is assumed; if the object touches one, give ground in scene.yaml"
+        )
+    return guesses
+
+
+def _gaps(folder: Path, pictures: Pictures, frame_count: int) -> list[str]:
+    """A sentence a camera that lacks frames, or one sentence where many do."""
+    lacking: dict[int, list[int]] = {}
+    for view, camera in enumerate(pictures.cameras):
+        missing = [frame for frame in range(frame_count) if (view, frame) not in pictures.paths]
+        if len(missing) == frame_count:
+            raise InputError(f"{folder} has none of the pictures of {camera.name}: remove it from the listing")
+        if missing:
+            lacking[view] = missing
+    for frame in range(frame_count):
+        if all((view, frame) not in pictures.paths for view in range(len(pictures.cameras))):
+            raise InputError(f"{folder} has no picture of any view at frame {frame}")
+    if len(lacking) == len(pictures.cameras) and all(len(gaps) == frame_count - 1 for gaps in lacking.values()):
+        return [
+            f"every one of the {len(lacking)} cameras sees one frame only, as with one camera that moves: "
+            "depth cannot be triangulated at any instant"
+        ]
+    told = [
+        f"{pictures.cameras[view].name} has no picture at frame {ranges(missing)}"
+        for view, missing in list(lacking.items())[:LISTED]
+    ]
+    if len(lacking) > LISTED:
+        told = [f"{len(lacking)} of {len(pictures.cameras)} cameras lack frames ({'; '.join(told)}; …)"]
+    return [f"{sentence}: treated as not visible" for sentence in told]
+
+
+def ranges(numbers: list[int]) -> str:
+    """Ascending whole numbers in short: 0–3, 7."""
+    runs: list[list[int]] = []
+    for value in numbers:
+        if runs and value == runs[-1][-1] + 1:
+            runs[-1].append(value)
+        else:
+            runs.append([value])
+    return ", ".join(f"{run[0]}" if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)

@@ -1,0 +1,180 @@
+"""Reading pictures and masks from files, whatever the layout."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from masiv.errors import InputError
+from masiv.scene import masks
+from masiv.scene.camera import Camera
+from masiv.scene.lens import Lens
+from masiv.scene.scene import Frame
+
+OCCLUDER_ALPHA = 50
+Key = tuple[int, int]  # camera index, frame
+
+
+@dataclass(frozen=True)
+class MaskSource:
+    """Where the mask of a picture comes from; ``words`` say it to a person.
+
+    alpha: the fourth channel of ``path``, or of the picture itself. mask: ``path`` is white on the object. cutout:
+    ``path`` has all but the object painted white. background: difference from the view's empty background. plain:
+    difference from the border's colour.
+    """
+
+    kind: Literal["alpha", "mask", "cutout", "background", "plain"]
+    words: str
+    path: Path | None = None
+
+
+PLAIN = MaskSource("plain", "plain background")
+OWN_ALPHA = MaskSource("alpha", "alpha channel of the pictures")
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Reads pictures and masks as the pinhole ``cameras`` see them.
+
+    ``lenses``, by camera, undistort; ``backgrounds`` are pictures of the empty scene, ``occluders`` have alpha where
+    something hides it, both by camera; ``crops``, by camera, are (H, W) bool, False where the object cannot be.
+    """
+
+    paths: dict[Key, Path]
+    masks: dict[Key, MaskSource]
+    cameras: tuple[Camera, ...]
+    lenses: dict[int, Lens] = field(default_factory=dict)
+    backgrounds: dict[int, Path] = field(default_factory=dict)
+    occluders: dict[int, Path] = field(default_factory=dict)
+    crops: tuple[np.ndarray, ...] | None = None
+
+    def load(self, view: int, frame: int) -> Frame:
+        """What ``view`` saw at ``frame``; a picture that does not exist is black and nowhere valid."""
+        camera = self.cameras[view]
+        path = self.paths.get((view, frame))
+        if path is None:
+            return _nothing(camera.height, camera.width)
+        image = self._read(view, path)
+        if self.masks[view, frame] == OWN_ALPHA and image.shape[-1] != 4:
+            raise InputError(
+                f"{path} has no alpha channel, unlike other pictures of {camera.name}: its mask is unknown"
+            )
+        mask = self._mask(view, self.masks[view, frame], image)
+        valid = np.ones(image.shape[:2], bool)
+        if view in self.lenses:
+            valid &= self.lenses[view].seen
+        if view in self.occluders:
+            occluder = self._read(view, self.occluders[view])
+            if occluder.shape[-1] == 4:
+                valid &= occluder[..., 3] <= OCCLUDER_ALPHA
+        if self.crops is not None:
+            mask = mask * self.crops[view]
+        return Frame(image[..., :3], mask, valid)
+
+    def background(self, view: int) -> np.ndarray | None:
+        """The empty scene in ``view``, (H, W, 3) uint8, where there is a picture of it."""
+        return self._read(view, self.backgrounds[view])[..., :3] if view in self.backgrounds else None
+
+    def mask_sources(self) -> tuple[str, list[str]]:
+        """The main source of the masks, in words, and a problem for each picture set that has another one."""
+        kinds: dict[str, list[str]] = {}
+        for key, path in self.paths.items():
+            kinds.setdefault(self.masks[key].words, []).append(path.name)
+        main, *others = sorted(kinds, key=lambda kind: -len(kinds[kind]))
+        problems = [f"{len(kinds[o])} pictures ({kinds[o][0]}, …) take their mask from {o}" for o in others]
+        if any(decoded(p).shape[-1] != 4 for p in self.occluders.values()):
+            problems.append("the occluder pictures (frame −2) have no alpha channel and are ignored")
+        return main, problems
+
+    def _mask(self, view: int, source: MaskSource, image: np.ndarray) -> np.ndarray:
+        other = None if source.path is None else self._read(view, source.path)
+        colour = np.ascontiguousarray(image[..., :3])
+        if source.kind == "alpha":
+            pixels = image if other is None else other
+            return pixels[..., 3 if pixels.shape[-1] == 4 else 0].astype(np.float32) / 255
+        if source.kind == "mask" and other is not None:
+            return _as_mask(other)
+        if source.kind == "cutout" and other is not None:
+            return masks.from_white(other[..., :3], colour)
+        if source.kind == "background":
+            return masks.from_background(colour, self._read(view, self.backgrounds[view])[..., :3])
+        return masks.from_plain_background(colour)
+
+    def _read(self, view: int, path: Path) -> np.ndarray:
+        pixels = decoded(path)
+        height, width = pixels.shape[:2]
+        camera = self.cameras[view]
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"{path} is {width}×{height}, the other pictures of its view are {camera.width}×{camera.height}"
+            )
+        return self.lenses[view].undistorted(pixels) if view in self.lenses else pixels
+
+
+def decoded(path: Path) -> np.ndarray:
+    """(H, W, 3) RGB or (H, W, 4) RGBA, uint8. Raises InputError for what is no picture."""
+    raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if raw is None:
+        raise InputError(f"{path} cannot be read as a picture: replace it or remove it from the listing")
+    raw = np.asarray(raw)
+    if raw.dtype == np.uint16:
+        raw = (raw // 256).astype(np.uint8)
+    if raw.dtype != np.uint8:
+        raise InputError(f"{path} has {raw.dtype} pixels: give pictures with 8 or 16 bits a channel")
+    if raw.ndim == 2:
+        return np.repeat(raw[..., None], 3, axis=-1)
+    return np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[-1]]])
+
+
+def size(path: Path) -> tuple[int, int]:
+    """Width and height, from the header where the file is a PNG."""
+    with path.open("rb") as file:
+        head = file.read(24)
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
+        return struct.unpack(">II", head[16:24])
+    height, width = decoded(path).shape[:2]
+    return width, height
+
+
+def common_size(paths: list[Path], of_what: str) -> tuple[int, int]:
+    """Width and height that all ``paths`` share. Raises InputError where they differ."""
+    sizes = {size(path): path for path in paths}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{path.name} {w}×{h}" for (w, h), path in sizes.items())
+        raise InputError(f"pictures of {of_what} differ in size: {listed}")
+    return next(iter(sizes))
+
+
+def cuts_out(path: Path) -> bool:
+    """Whether the picture has an alpha channel that is not opaque everywhere."""
+    pixels = decoded(path)
+    return pixels.shape[-1] == 4 and bool((pixels[..., 3] < 255).any())
+
+
+def crop(camera: Camera, corners: np.ndarray) -> np.ndarray:
+    """Pixels (H, W) bool that a box with these corners (8, 3) covers; all for a box that reaches behind the camera."""
+    pixels, depth = camera.project(corners)
+    if depth.min() <= 1e-6:
+        return np.ones((camera.height, camera.width), bool)
+    hull = cv2.convexHull(np.clip(pixels, -1e6, 1e6).astype(np.int32))
+    return cv2.fillConvexPoly(np.zeros((camera.height, camera.width), np.uint8), hull, 1).astype(bool)
+
+
+def _as_mask(pixels: np.ndarray) -> np.ndarray:
+    """Mask from a mask picture: its alpha where that varies, else its brightness; 0 and 1 count as 0 and 255."""
+    alpha_varies = pixels.shape[-1] == 4 and (pixels[..., 3] != pixels[0, 0, 3]).any()
+    values = (pixels[..., 3] if alpha_varies else pixels[..., :3].max(axis=-1)).astype(np.float32)
+    return values if values.max() <= 1 else values / 255
+
+
+@cache
+def _nothing(height: int, width: int) -> Frame:
+    shape = height, width
+    return Frame(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32), np.zeros(shape, bool))
