@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.classical_fit import (
-    FamilyFit,
-    best_family,
-    fit_all_particles,
-    fit_family,
-    information_criterion,
-)
+from masiv.identify.classical_fit import FamilyFit, fit_all_particles, fit_family, information_criteria, ranked
 from masiv.identify.families import FAMILIES
 from masiv.identify.found import Found
 from masiv.identify.problem import Motion, Problem
 from masiv.progress import Progress
+
+SHORT = 1 / 3
+FINALISTS = 2
 
 
 def identify_classical(
@@ -25,9 +24,15 @@ def identify_classical(
 ) -> Found:
     """``problem.config.law`` is a family or auto. Raises MasivError where no family explains the motion."""
     law = problem.config.law
-    kinds = list(FAMILIES) if law == "auto" else [law]
-    fits, failures = _fits(kinds, few, motion, first_frames, checkpoint, progress)
-    chosen = fit_all_particles(best_family(fits), few, problem, checkpoint, progress)
+    fit = functools.partial(
+        fit_family, few=few, motion=motion, first_frames=first_frames, checkpoint=checkpoint, progress=progress
+    )
+    failures: dict[str, str] = {}
+    if law == "auto":
+        fits, failures = _shortlisted(fit)
+    else:
+        fits = [fit(law)]
+    chosen = fit_all_particles(ranked(fits)[0], few, problem, checkpoint, progress)
     errors = {name: _known(chosen.stderr[name]) for name in chosen.values if name not in chosen.law.values}
     report: dict[str, Any] = {
         "law": chosen.kind,
@@ -43,38 +48,35 @@ def identify_classical(
     return Found(chosen.law, chosen.motion, chosen.contact, chosen.error_m, report)
 
 
-def _fits(
-    kinds: list[str], few: Problem, motion: Motion, first_frames: int, checkpoint: Checkpoint, progress: Progress
-) -> tuple[list[FamilyFit], dict[str, str]]:
-    """The fits of ``kinds`` on few particles, and why the others failed. Raises MasivError where all did."""
-    fits: list[FamilyFit] = []
+def _shortlisted(fit: Callable[..., FamilyFit]) -> tuple[list[FamilyFit], dict[str, str]]:
+    """Short fits of every family, then the best ``FINALISTS`` in full; and why the others failed."""
+    fits: dict[str, FamilyFit] = {}
     failures: dict[str, str] = {}
-    for kind in kinds:
+    for kind in FAMILIES:
         try:
-            fits.append(fit_family(kind, few, motion, first_frames, checkpoint, progress))
+            fits[kind] = fit(kind, share=SHORT)
         except MasivError as failed:
-            if len(kinds) == 1:
-                raise
             failures[kind] = str(failed)
     if not fits:
         raise MasivError(f"identify: no classical law explains the motion ({next(iter(failures.values()))})")
-    return fits, failures
+    for kind in [f.kind for f in ranked(list(fits.values()))[:FINALISTS]]:
+        fits[kind] = fit(kind, further=True)
+    return list(fits.values()), failures
 
 
 def family_rows(fits: list[FamilyFit]) -> list[dict[str, Any]]:
-    """Errors and parameters of each family, best first, as fitted on few particles."""
-    samples = min(fits, key=lambda f: f.mean_square).samples
-    criteria = {f.kind: information_criterion(f, samples) for f in fits}
-    least = min(criteria.values())
+    """Errors and parameters of each family, best first, as fitted on few particles, those that lag in short."""
+    order = ranked(fits)
+    criteria = information_criteria(fits)
     return [
         {
             "law": f.kind,
             "trajectory_error_mm": 1e3 * f.error_m,
-            "bic_above_best": criteria[f.kind] - least,
+            "bic_above_best": criteria[f.kind] - criteria[order[0].kind],
             "contact": f.contact,
             "parameters": f.law.description()["parameters"],
         }
-        for f in sorted(fits, key=lambda f: criteria[f.kind])
+        for f in order
     ]
 
 

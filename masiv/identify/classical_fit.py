@@ -33,8 +33,7 @@ class FamilyFit:
     """What a family makes of a motion. values and stderr: law and throw (simulation frame), in each one's unit.
 
     error_m: mean distance to the trajectories over all frames. mean_square [m^2] and samples: of the residual and how
-    many independent ones it is worth. stage: how far the fit is (0 searched, 1 and 2 fitted on few particles, 3 on
-    all).
+    many independent ones it is worth. stage: how far the fit is (0 searched, 1 to 3 fitted on few particles, 4 on all).
     """
 
     kind: str
@@ -97,9 +96,21 @@ def search(problem: Problem, family: Family, motion: Motion, progress: Progress)
 
 
 def fit_family(
-    kind: str, few: Problem, motion: Motion, first_frames: int, checkpoint: Checkpoint, progress: Progress
+    kind: str,
+    few: Problem,
+    motion: Motion,
+    first_frames: int,
+    checkpoint: Checkpoint,
+    progress: Progress,
+    *,
+    share: float = 1.0,
+    further: bool = False,
 ) -> FamilyFit:
-    """``kind`` fitted on few particles. Goes on from, and saves after each stage to, ``checkpoint`` under its name."""
+    """``kind`` fitted on few particles. Goes on from, and saves after each stage to, ``checkpoint`` under its name.
+
+    share: of the rollouts that the configuration allows a stage. further: fit all frames once more from where such a
+    shortened fit ended. Raises MasivError where every start diverges.
+    """
     family = FAMILIES[kind].scaled(few.scene.density)
     saved = (checkpoint.load() or {}).get(kind)
     if saved is None:
@@ -108,11 +119,12 @@ def fit_family(
     else:
         found = FamilyFit(**saved)
     middle = min(few.frames, max(first_frames, (few.frames + 1) // 2))
-    for stage, frames in ((1, middle), (2, few.frames)):
-        if found.stage >= stage:
+    budget = max(2, round(share * few.config.family_rollouts))
+    for stage, frames in ((1, middle), (2, few.frames), (3, few.frames if further else 0)):
+        if found.stage >= stage or frames == 0:
             continue
         label = f"identify: {kind} fit, {frames} frames"
-        found = _stage(few, family, found, frames, stage, label, progress)
+        found = _stage(few, family, found, frames, stage, budget, label, progress)
         _keep(checkpoint, found)
     return found
 
@@ -122,11 +134,18 @@ def _keep(checkpoint: Checkpoint, found: FamilyFit) -> None:
 
 
 def _stage(
-    problem: Problem, family: Family, found: FamilyFit, frames: int, stage: int, label: str, progress: Progress
+    problem: Problem,
+    family: Family,
+    found: FamilyFit,
+    frames: int,
+    stage: int,
+    budget: int,
+    label: str,
+    progress: Progress,
 ) -> FamilyFit:
     """Gauss-Newton over ``frames`` from what was found."""
     rollouts = Rollouts(problem, family, found.contact, frames)
-    budget, done = problem.config.family_rollouts, 0
+    done = 0
 
     def residual(values: dict[str, float]) -> np.ndarray:
         nonlocal done
@@ -150,7 +169,7 @@ def fit_all_particles(
 
     A finer body is a little stiffer and loses less to the grid, which moves the residual more than its derivative.
     """
-    if found.stage >= 3:
+    if found.stage >= 4:
         return found
     label = f"identify: {found.kind} fit, all particles"
     total = CHORD_STEPS + 2
@@ -187,7 +206,7 @@ def fit_all_particles(
     weight = robust_weight(residual, softness)
     spread = covariance(jacobian * weight[:, None], residual * weight)
     estimate = Estimate(values, spread, jacobian, residual, coarse.evaluations + CHORD_STEPS + 1, tuple(parameters))
-    found = _updated(few, found, estimate, residual.reshape(-1, few.count, 3), 3)
+    found = _updated(few, found, estimate, residual.reshape(-1, few.count, 3), 4)
     found.error_m = mean_distance(best)
     _keep(checkpoint, found)
     progress(label, total, total, f"{1e3 * found.error_m:.1f} mm")
@@ -203,21 +222,20 @@ def _moved(parameters: list[Parameter], values: dict[str, float], step: np.ndarr
     return out
 
 
-def best_family(fits: list[FamilyFit]) -> FamilyFit:
-    """The family with the least Bayesian information criterion: of two that explain as much, the one with fewer
-    parameters. Residuals are worth as many samples as the best family's."""
-    samples = min(fits, key=lambda f: f.mean_square).samples
-    return min(fits, key=lambda f: information_criterion(f, samples))
+def information_criteria(fits: list[FamilyFit]) -> dict[str, float]:
+    """BIC of normal residuals by family, n ln(mean square) + k ln(n), n those of the best; only differences count."""
+    samples = max(1, min(fits, key=lambda f: f.mean_square).samples)
+    return {f.kind: samples * math.log(max(f.mean_square, 1e-300)) + len(f.values) * math.log(samples) for f in fits}
 
 
-def information_criterion(found: FamilyFit, samples: int) -> float:
-    """BIC of normal residuals, n ln(mean square) + k ln(n); only differences count."""
-    return samples * math.log(max(found.mean_square, 1e-300)) + len(found.values) * math.log(max(samples, 1))
+def ranked(fits: list[FamilyFit]) -> list[FamilyFit]:
+    """Best first: of two families that explain as much, the one with fewer parameters."""
+    criteria = information_criteria(fits)
+    return sorted(fits, key=lambda f: criteria[f.kind])
 
 
 def _parameters(problem: Problem, family: Family, found: FamilyFit) -> list[Parameter]:
-    motion = motion_parameters(problem, found.motion)
-    both = [*family.parameters, *motion]
+    both = [*family.parameters, *motion_parameters(problem, found.motion)]
     return [replace(p, start=float(np.clip(found.values[p.name], p.lower, p.upper))) for p in both]
 
 

@@ -20,7 +20,7 @@ class IdentifyConfig(BaseModel):
         description="what is fitted: a neural law, a small correction of a classical law, a classical law's "
         "parameters, or (auto) the classical law that explains the motion best",
     )
-    family_rollouts: int = Field(60, ge=2, description="rollouts of each of the two stages of a classical law's fit")
+    family_rollouts: int = Field(45, ge=2, description="rollouts of each of the two stages of a classical law's fit")
     start: Literal["auto", "jelly", "plasticine", "sand", "water"] = Field(
         "auto", description="pretrained law to start from; auto takes the one that explains the motion best"
     )
