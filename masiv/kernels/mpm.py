@@ -20,9 +20,26 @@ import taichi as ti
 STICKY, RELEASE, SLIP, NO_GROUND = 0, 1, 2, 3
 
 # Entries of ``constants``.
-DT, DX, MASS, VOLUME, GRAVITY_X, GRAVITY_Y, GRAVITY_Z, FRICTION, CONSTANT_COUNT = range(9)
+DT, DX, VOLUME, GRAVITY_X, GRAVITY_Y, GRAVITY_Z, FRICTION, CONSTANT_COUNT = range(8)
 
 NO_FAULT = (1 << 62) - 1
+
+
+@ti.func
+def column(a, c: ti.template()):
+    return ti.Vector([a[0, c], a[1, c], a[2, c]])
+
+
+@ti.func
+def momentum_of(value):
+    """The first three of four."""
+    return ti.Vector([value[0], value[1], value[2]])
+
+
+@ti.func
+def by_columns(a, b, c):
+    """The matrix of three columns, of which the first three entries count."""
+    return ti.Matrix([[a[0], b[0], c[0]], [a[1], b[1], c[1]], [a[2], b[2], c[2]]])
 
 
 @ti.data_oriented
@@ -53,9 +70,13 @@ class MpmKernels:
         self.trial_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
         self.gradient_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
         self.stress_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
+        self.particle_mass = ti.field(real, shape=capacity_particles)
+        self.mass_bar = ti.field(real, shape=capacity_particles)
         self.private = ti.Vector.field(4, real, shape=(self.chunks, capacity_nodes))
-        self.grid_momentum = ti.Vector.field(4, real, shape=capacity_nodes)
-        self.grid_velocity = ti.Vector.field(3, real, shape=capacity_nodes)
+        # (momentum, mass) of the nodes: scratch, then a log from which the adjoint takes the grids of past substeps.
+        self.capacity_log = capacity_nodes + capacity_steps * max(4096, capacity_particles)
+        self.grid_momentum = ti.Vector.field(4, real, shape=self.capacity_log)
+        self.grid_velocity = ti.Vector.field(4, real, shape=capacity_nodes)  # the fourth pads: one aligned load
         self.grid_momentum_bar = ti.Vector.field(4, real, shape=capacity_nodes)
         self.constants = ti.field(real, shape=CONSTANT_COUNT)
         self.contact = ti.field(ti.i32, shape=())
@@ -109,7 +130,7 @@ class MpmKernels:
 
     @ti.func
     def p2g_particle(self, t: ti.i32, s: ti.i32, p: ti.i32):
-        dx, dt, mass = self.constants[DX], self.constants[DT], self.constants[MASS]
+        dx, dt, mass = self.constants[DX], self.constants[DT], self.particle_mass[p]
         local, fx, fits = self.stencil(self.position[s, p], dx)
         if fits:
             ny, nz = self.window_shape[None][1], self.window_shape[None][2]
@@ -122,12 +143,13 @@ class MpmKernels:
             affine *= dx
             for i in range(3):
                 row = ((local[0] + i) * ny + local[1]) * nz + local[2]
-                wx = w[i, 0]
-                for j, k in ti.static(ti.ndrange(3, 3)):
-                    weight = wx * w[j, 1] * w[k, 2]
-                    momentum = corner + affine @ ti.Vector([i, j, k])
-                    value = weight * ti.Vector([momentum[0], momentum[1], momentum[2], mass])
-                    self.add(t, row + j * nz + k, value)
+                for j in ti.static(range(3)):
+                    along = corner + i * column(affine, 0) + j * column(affine, 1)
+                    weight = w[i, 0] * w[j, 1]
+                    for k in ti.static(range(3)):
+                        m = (weight * w[k, 2]) * (along + k * column(affine, 2))
+                        value = ti.Vector([m[0], m[1], m[2], weight * w[k, 2] * mass])
+                        self.add(t, row + j * nz + k, value)
         else:
             ti.atomic_min(self.fault[1], (ti.cast(s, ti.i64) << 32) | p)
 
@@ -147,29 +169,70 @@ class MpmKernels:
                     self.p2g_particle(t, s, p)
 
     @ti.func
-    def node_height(self, n: ti.i32):
-        """Lattice index along y of node n; the ground plane is at 0."""
-        return self.window_origin[None][1] + (n // self.window_shape[None][2]) % self.window_shape[None][1]
+    def node_height(self, row: ti.i32):
+        """Lattice index along y of a row of nodes (all k of one i, j); the ground plane is at 0."""
+        return self.window_origin[None][1] + row % self.window_shape[None][1]
 
     @ti.func
-    def free_velocity(self, value):
-        """Velocity of a node after gravity, before contact. value: (momentum, mass) with mass > 0."""
-        gravity = ti.Vector([self.constants[GRAVITY_X], self.constants[GRAVITY_Y], self.constants[GRAVITY_Z]])
-        return ti.Vector([value[0], value[1], value[2]]) / value[3] + self.constants[DT] * gravity
+    def rows(self):
+        return self.window_shape[None][0] * self.window_shape[None][1]
 
-    @ti.kernel
-    def grid_update(self, nodes: ti.i32):
-        for n in range(nodes):
-            value = self.private[0, n]
-            for t in ti.static(range(1, self.chunks)):
-                value += self.private[t, n]
-            self.grid_momentum[n] = value
+    @ti.func
+    def gravity(self):
+        return ti.Vector([self.constants[GRAVITY_X], self.constants[GRAVITY_Y], self.constants[GRAVITY_Z]])
+
+    @ti.func
+    def sum_of_chunks(self, n: ti.i32):
+        value = self.private[0, n]
+        for t in ti.static(range(1, self.chunks)):
+            value += self.private[t, n]
+        return value
+
+    @ti.func
+    def row_velocities(self, row: ti.i32, offset: ti.i32):
+        """Velocity after gravity and contact of a row's nodes, from their momenta in the log at ``offset``."""
+        nz = self.window_shape[None][2]
+        kick = self.constants[DT] * self.gravity()
+        grounded = self.contact[None] != NO_GROUND and self.node_height(row) <= 0
+        for n in range(row * nz, (row + 1) * nz):
+            value = self.grid_momentum[offset + n]
             v = ti.Vector.zero(self.real, 3)
             if value[3] > 0.0:
-                v = self.free_velocity(value)
-                if self.contact[None] != NO_GROUND and self.node_height(n) <= 0:
+                v = momentum_of(value) / value[3] + kick
+                if grounded:
                     v = self.contact_velocity(v)
-            self.grid_velocity[n] = v
+            self.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
+
+    @ti.func
+    def row_update(self, row: ti.i32, offset: ti.i32):
+        nz = self.window_shape[None][2]
+        for n in range(row * nz, (row + 1) * nz):
+            self.grid_momentum[offset + n] = self.sum_of_chunks(n)
+        self.row_velocities(row, offset)
+
+    @ti.kernel
+    def grid_update(self, offset: ti.i32):
+        """Sum the chunks' grids into the log at ``offset``, and the velocities that follow."""
+        if ti.static(self.gpu):
+            for row in range(self.rows()):
+                self.row_update(row, offset)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.chunks):
+                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
+                    self.row_update(row, offset)
+
+    @ti.kernel
+    def grid_velocities(self, offset: ti.i32):
+        """``grid_update`` from a logged grid."""
+        if ti.static(self.gpu):
+            for row in range(self.rows()):
+                self.row_velocities(row, offset)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.chunks):
+                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
+                    self.row_velocities(row, offset)
 
     @ti.func
     def contact_velocity(self, v):
@@ -197,18 +260,24 @@ class MpmKernels:
         if fits:
             ny, nz = self.window_shape[None][1], self.window_shape[None][2]
             w = self.weights(fx)
-            v = ti.Vector.zero(self.real, 3)
-            b = ti.Matrix.zero(self.real, 3, 3)  # sum w v_i (i, j, k)^T, in cells from the stencil's corner
+            v4 = ti.Vector.zero(self.real, 4)
+            # sum w v_i (i, j, k)^T by columns, in cells from the stencil's corner
+            b0, b1, b2 = ti.Vector.zero(self.real, 4), ti.Vector.zero(self.real, 4), ti.Vector.zero(self.real, 4)
             for i in range(3):
                 row = ((local[0] + i) * ny + local[1]) * nz + local[2]
-                wx = w[i, 0]
-                for j, k in ti.static(ti.ndrange(3, 3)):
-                    wv = (wx * w[j, 1] * w[k, 2]) * self.grid_velocity[row + j * nz + k]
-                    v += wv
-                    for a in ti.static(range(3)):
-                        b[a, 0] += wv[a] * i
-                        b[a, 1] += wv[a] * j
-                        b[a, 2] += wv[a] * k
+                plane = ti.Vector.zero(self.real, 4)
+                for j in ti.static(range(3)):
+                    first = w[0, 2] * self.grid_velocity[row + j * nz]
+                    second = w[1, 2] * self.grid_velocity[row + j * nz + 1]
+                    third = w[2, 2] * self.grid_velocity[row + j * nz + 2]
+                    line = w[j, 1] * (first + second + third)
+                    plane += line
+                    b1 += (w[i, 0] * j) * line
+                    b2 += (w[i, 0] * w[j, 1]) * (second + 2.0 * third)
+                v4 += w[i, 0] * plane
+                b0 += (w[i, 0] * i) * plane
+            b = by_columns(b0, b1, b2)
+            v = momentum_of(v4)
             affine = (4.0 / dx) * (b - v.outer_product(fx))
             if not v.norm() * dt < dx:  # also true for NaN
                 ti.atomic_min(self.fault[0], (ti.cast(s, ti.i64) << 32) | p)
@@ -227,11 +296,19 @@ class MpmKernels:
     def bounds(self, s: ti.i32, count: ti.i32) -> ti.types.vector(7, ti.f64):
         """Lower corner, upper corner [m] and the largest speed [m/s] of the particles at substep s."""
         out = ti.Vector([1e30, 1e30, 1e30, -1e30, -1e30, -1e30, 0.0], dt=ti.f64)
-        for p in range(count):
+        parts = ti.static(1024 if self.gpu else self.chunks)
+        ti.loop_config(block_dim=128 if self.gpu else 1)
+        for t in range(parts):
+            low, high = ti.Vector([1e30, 1e30, 1e30]), ti.Vector([-1e30, -1e30, -1e30])
+            speed = ti.cast(0.0, self.real)
+            for p in range(t * count // parts, (t + 1) * count // parts):
+                low = ti.min(low, self.position[s, p])
+                high = ti.max(high, self.position[s, p])
+                speed = ti.max(speed, self.velocity[s, p].norm())
             for a in ti.static(range(3)):
-                ti.atomic_min(out[a], ti.cast(self.position[s, p][a], ti.f64))
-                ti.atomic_max(out[3 + a], ti.cast(self.position[s, p][a], ti.f64))
-            ti.atomic_max(out[6], ti.cast(self.velocity[s, p].norm(), ti.f64))
+                ti.atomic_min(out[a], ti.cast(low[a], ti.f64))
+                ti.atomic_max(out[3 + a], ti.cast(high[a], ti.f64))
+            ti.atomic_max(out[6], ti.cast(speed, ti.f64))
         return out
 
     @ti.kernel
@@ -266,21 +343,22 @@ class MpmKernels:
         slope = (4.0 / dx) * c_bar
         corner = v_bar - slope @ fx
         x_bar = ti.Vector.zero(self.real, 3)
-        v_sum = ti.Vector.zero(self.real, 3)
         for i in range(3):
             row = ((local[0] + i) * ny + local[1]) * nz + local[2]
-            wx, gx = w[i, 0], g[i, 0]
-            for j, k in ti.static(ti.ndrange(3, 3)):
-                node = row + j * nz + k
-                weight = wx * w[j, 1] * w[k, 2]
-                vi = self.grid_velocity[node]
-                push = corner + slope @ ti.Vector([i, j, k])
-                value = weight * push
-                self.add(t, node, ti.Vector([value[0], value[1], value[2], 0.0]))
-                along = vi.dot(push)
-                x_bar += along * ti.Vector([gx * w[j, 1] * w[k, 2], wx * g[j, 1] * w[k, 2], wx * w[j, 1] * g[k, 2]])
-                v_sum += weight * vi
-        self.position_bar[p] += (x_bar - slope.transpose() @ v_sum) / dx
+            for j in ti.static(range(3)):
+                weight = w[i, 0] * w[j, 1]
+                push_j = corner + i * column(slope, 0) + j * column(slope, 1)
+                along, along_slope = ti.cast(0.0, self.real), ti.cast(0.0, self.real)
+                for k in ti.static(range(3)):
+                    node = row + j * nz + k
+                    push = push_j + k * column(slope, 2)
+                    value = (weight * w[k, 2]) * push
+                    self.add(t, node, ti.Vector([value[0], value[1], value[2], 0.0]))
+                    dot = momentum_of(self.grid_velocity[node]).dot(push)
+                    along += w[k, 2] * dot
+                    along_slope += g[k, 2] * dot
+                x_bar += ti.Vector([g[i, 0] * w[j, 1] * along, w[i, 0] * g[j, 1] * along, weight * along_slope])
+        self.position_bar[p] += (x_bar - slope.transpose() @ self.velocity[s + 1, p]) / dx
 
     @ti.kernel
     def g2p_adjoint(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
@@ -297,21 +375,32 @@ class MpmKernels:
                 for p in range(t * count // self.chunks, (t + 1) * count // self.chunks):
                     self.g2p_adjoint_particle(t, s, p)
 
-    @ti.kernel
-    def grid_adjoint(self, nodes: ti.i32):
-        for n in range(nodes):
-            sums = self.private[0, n]
-            for t in ti.static(range(1, self.chunks)):
-                sums += self.private[t, n]
+    @ti.func
+    def row_adjoint(self, row: ti.i32, offset: ti.i32):
+        nz = self.window_shape[None][2]
+        kick = self.constants[DT] * self.gravity()
+        grounded = self.contact[None] != NO_GROUND and self.node_height(row) <= 0
+        for n in range(row * nz, (row + 1) * nz):
             out = ti.Vector.zero(self.real, 4)
-            value = self.grid_momentum[n]
+            value = self.grid_momentum[offset + n]
             if value[3] > 0.0:
-                bar = ti.Vector([sums[0], sums[1], sums[2]])
-                if self.contact[None] != NO_GROUND and self.node_height(n) <= 0:
-                    bar = self.contact_adjoint(self.free_velocity(value), bar)
-                momentum = ti.Vector([value[0], value[1], value[2]])
+                bar = momentum_of(self.sum_of_chunks(n))
+                momentum = momentum_of(value)
+                if grounded:
+                    bar = self.contact_adjoint(momentum / value[3] + kick, bar)
                 out = ti.Vector([bar[0], bar[1], bar[2], -bar.dot(momentum) / value[3]]) / value[3]
             self.grid_momentum_bar[n] = out
+
+    @ti.kernel
+    def grid_adjoint(self, offset: ti.i32):
+        if ti.static(self.gpu):
+            for row in range(self.rows()):
+                self.row_adjoint(row, offset)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.chunks):
+                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
+                    self.row_adjoint(row, offset)
 
     @ti.func
     def contact_adjoint(self, v, bar):
@@ -331,39 +420,53 @@ class MpmKernels:
                     out = ti.Vector([kept * bar[0] + turn * v[0], mu * along, kept * bar[2] + turn * v[2]])
         return out
 
+    @ti.func
+    def p2g_adjoint_particle(self, s: ti.i32, p: ti.i32):
+        dx, dt, mass = self.constants[DX], self.constants[DT], self.particle_mass[p]
+        local, fx, _ = self.stencil(self.position[s, p], dx)
+        ny, nz = self.window_shape[None][1], self.window_shape[None][2]
+        w, g = self.weights(fx), self.weight_slopes(fx)
+        stress_factor = dt * self.constants[VOLUME] * 4.0 / (dx * dx)
+        affine = mass * self.affine_velocity[s, p] - stress_factor * self.kirchhoff_stress[s, p]
+        corner = mass * self.velocity[s, p] - affine @ (fx * dx)
+        step = dx * affine
+        total = ti.Vector.zero(self.real, 4)  # sum w bar
+        b0, b1, b2 = ti.Vector.zero(self.real, 4), ti.Vector.zero(self.real, 4), ti.Vector.zero(self.real, 4)
+        x_bar = ti.Vector.zero(self.real, 3)
+        for i in range(3):
+            row = ((local[0] + i) * ny + local[1]) * nz + local[2]
+            plane = ti.Vector.zero(self.real, 4)
+            for j in ti.static(range(3)):
+                weight = w[i, 0] * w[j, 1]
+                momentum_j = corner + i * column(step, 0) + j * column(step, 1)
+                along, along_slope = ti.cast(0.0, self.real), ti.cast(0.0, self.real)
+                line, tilt = ti.Vector.zero(self.real, 4), ti.Vector.zero(self.real, 4)
+                for k in ti.static(range(3)):
+                    bar = self.grid_momentum_bar[row + j * nz + k]
+                    momentum = momentum_j + k * column(step, 2)
+                    dot = momentum.dot(momentum_of(bar)) + mass * bar[3]
+                    along += w[k, 2] * dot
+                    along_slope += g[k, 2] * dot
+                    line += w[k, 2] * bar
+                    tilt += (k * w[k, 2]) * bar
+                x_bar += ti.Vector([g[i, 0] * w[j, 1] * along, w[i, 0] * g[j, 1] * along, weight * along_slope])
+                plane += w[j, 1] * line
+                b1 += (weight * j) * line
+                b2 += weight * tilt
+            total += w[i, 0] * plane
+            b0 += (w[i, 0] * i) * plane
+        v_bar = momentum_of(total)
+        affine_bar = dx * (by_columns(b0, b1, b2) - v_bar.outer_product(fx))
+        self.position_bar[p] += x_bar / dx - affine.transpose() @ v_bar
+        self.mass_bar[p] += self.velocity[s, p].dot(v_bar) + (self.affine_velocity[s, p] * affine_bar).sum() + total[3]
+        self.velocity_bar[p] = mass * v_bar
+        self.affine_bar[p] = mass * affine_bar
+        self.stress_bar[p] = -stress_factor * affine_bar
+
     @ti.kernel
     def p2g_adjoint(self, s: ti.i32, count: ti.i32):
         for p in range(count):
-            dx, dt, mass = self.constants[DX], self.constants[DT], self.constants[MASS]
-            local, fx, _ = self.stencil(self.position[s, p], dx)
-            ny, nz = self.window_shape[None][1], self.window_shape[None][2]
-            w, g = self.weights(fx), self.weight_slopes(fx)
-            stress_factor = dt * self.constants[VOLUME] * 4.0 / (dx * dx)
-            affine = mass * self.affine_velocity[s, p] - stress_factor * self.kirchhoff_stress[s, p]
-            corner = mass * self.velocity[s, p] - affine @ (fx * dx)
-            v_bar = ti.Vector.zero(self.real, 3)
-            b = ti.Matrix.zero(self.real, 3, 3)
-            x_bar = ti.Vector.zero(self.real, 3)
-            for i in range(3):
-                row = ((local[0] + i) * ny + local[1]) * nz + local[2]
-                wx, gx = w[i, 0], g[i, 0]
-                for j, k in ti.static(ti.ndrange(3, 3)):
-                    bar = self.grid_momentum_bar[row + j * nz + k]
-                    push = ti.Vector([bar[0], bar[1], bar[2]])
-                    momentum = corner + dx * (affine @ ti.Vector([i, j, k]))
-                    along = momentum.dot(push) + mass * bar[3]
-                    x_bar += along * ti.Vector([gx * w[j, 1] * w[k, 2], wx * g[j, 1] * w[k, 2], wx * w[j, 1] * g[k, 2]])
-                    wp = (wx * w[j, 1] * w[k, 2]) * push
-                    v_bar += wp
-                    for a in ti.static(range(3)):
-                        b[a, 0] += wp[a] * i
-                        b[a, 1] += wp[a] * j
-                        b[a, 2] += wp[a] * k
-            affine_bar = dx * (b - v_bar.outer_product(fx))
-            self.position_bar[p] += x_bar / dx - affine.transpose() @ v_bar
-            self.velocity_bar[p] = mass * v_bar
-            self.affine_bar[p] = mass * affine_bar
-            self.stress_bar[p] = -stress_factor * affine_bar
+            self.p2g_adjoint_particle(s, p)
 
     # ---- to and from torch ---------------------------------------------------------------------------------------
 
@@ -402,6 +505,11 @@ class MpmKernels:
                     trial[p, a, b] = self.trial_gradient[s, p][a, b]
 
     @ti.kernel
+    def write_mass(self, mass: ti.types.ndarray()):
+        for p in range(mass.shape[0]):
+            self.particle_mass[p] = mass[p]
+
+    @ti.kernel
     def read_position(self, s: ti.i32, position: ti.types.ndarray()):
         for p in range(position.shape[0]):
             for a in ti.static(range(3)):
@@ -420,6 +528,7 @@ class MpmKernels:
             self.velocity_bar[p] = ti.Vector.zero(self.real, 3)
             self.affine_bar[p] = ti.Matrix.zero(self.real, 3, 3)
             self.trial_bar[p] = ti.Matrix.zero(self.real, 3, 3)
+            self.mass_bar[p] = 0.0
 
     @ti.kernel
     def read_bars(

@@ -1,78 +1,228 @@
-"""Kernels that apply the neural law to the fields of a simulator, and their adjoints."""
+"""Kernels that apply the neural law to the fields of a simulator, and their adjoint.
+
+The networks are functions of three numbers, so their values on a lattice (``masiv.materials.table``) are the law: a
+particle interpolates the lattice, the adjoint scatters to it, and the networks run once a rollout, not once a substep.
+"""
 
 import taichi as ti
 
 from masiv.kernels import tensor
+from masiv.materials.table import COUNTS, LOWER, STEP
 
 
 @ti.data_oriented
 class NeuralKernels:
-    """A law whose coefficients are functions of the strain invariants, evaluated in torch between two kernels.
-
-    share (N, 2) are the coefficients of ``tensor.neural_flow``, moduli (N, 4) those of ``tensor.neural_stress``. The
-    adjoints are by hand: Taichi's autodiff takes a minute to compile the inverses.
-    """
+    """``moduli`` (nodes, 4): ln g1, ln g2, ln kappa, coupling of ``tensor.neural_stress`` [Pa]; ``rates`` (nodes, 2):
+    logarithms [1/s] of the relaxation rates behind ``tensor.neural_flow``. ``*_bar`` are their adjoints by chunk."""
 
     def __init__(self, mpm):
         self.mpm = mpm
+        self.owner = None  # the rollout whose tables the fields hold
+        nodes = COUNTS[0] * COUNTS[1] * COUNTS[2]
+        self.moduli = ti.Vector.field(4, mpm.real, shape=nodes)
+        self.rates = ti.Vector.field(2, mpm.real, shape=nodes)
+        self.strains = ti.field(mpm.real, shape=2)  # strain scale of the elastic and of the plastic features
+        self.substep = ti.field(mpm.real, shape=())
+        self.moduli_bar = ti.Vector.field(4, mpm.real, shape=(mpm.chunks, nodes))
+        self.rates_bar = ti.Vector.field(2, mpm.real, shape=(mpm.chunks, nodes))
+        self.flow_strain_bar = ti.field(mpm.real, shape=mpm.capacity_particles)
 
     @ti.kernel
-    def trial_invariants(self, s: ti.i32, out: ti.types.ndarray()):
-        for p in range(out.shape[0]):
-            value = tensor.invariants(self.mpm.trial_gradient[s, p])
-            for a in ti.static(range(3)):
-                out[p, a] = value[a]
-
-    @ti.kernel
-    def elastic_invariants(self, s: ti.i32, out: ti.types.ndarray()):
-        for p in range(out.shape[0]):
-            value = tensor.invariants(self.mpm.deformation_gradient[s, p])
-            for a in ti.static(range(3)):
-                out[p, a] = value[a]
-
-    @ti.kernel
-    def flow(self, s: ti.i32, share: ti.types.ndarray(), out: ti.types.ndarray()):
-        """Apply the flow, and give the invariants (N, 3) of what is left."""
-        for p in range(out.shape[0]):
-            f = tensor.neural_flow(self.mpm.trial_gradient[s, p], ti.Vector([share[p, 0], share[p, 1]]))
-            self.mpm.deformation_gradient[s, p] = f
-            value = tensor.invariants(f)
-            for a in ti.static(range(3)):
-                out[p, a] = value[a]
-
-    @ti.kernel
-    def elastic(self, s: ti.i32, moduli: ti.types.ndarray()):
-        for p in range(moduli.shape[0]):
-            c = ti.Vector([moduli[p, 0], moduli[p, 1], moduli[p, 2], moduli[p, 3]])
-            self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(self.mpm.deformation_gradient[s, p], c)
-
-    @ti.kernel
-    def elastic_adjoint(self, s: ti.i32, moduli: ti.types.ndarray(), moduli_bar: ti.types.ndarray()):
-        """``stress_bar`` -> added to ``gradient_bar``, and moduli_bar (N, 4)."""
-        for p in range(moduli.shape[0]):
-            c = ti.Vector([moduli[p, 0], moduli[p, 1], moduli[p, 2], moduli[p, 3]])
-            f_bar, c_bar = tensor.neural_stress_adjoint(self.mpm.deformation_gradient[s, p], c, self.mpm.stress_bar[p])
-            self.mpm.gradient_bar[p] += f_bar
-            for a in ti.static(range(4)):
-                moduli_bar[p, a] = c_bar[a]
-
-    @ti.kernel
-    def flow_adjoint(
-        self, s: ti.i32, share: ti.types.ndarray(), invariants_bar: ti.types.ndarray(), share_bar: ti.types.ndarray()
+    def write_tables(
+        self,
+        moduli: ti.types.ndarray(),
+        rates: ti.types.ndarray(),
+        elastic: ti.f64,
+        plastic: ti.f64,
+        dt: ti.f64,
+        count: ti.i32,
     ):
-        """``gradient_bar`` and the adjoint (N, 3) of the elastic invariants -> ``trial_bar``, and share_bar (N, 2)."""
-        for p in range(share.shape[0]):
-            bar = ti.Vector([invariants_bar[p, 0], invariants_bar[p, 1], invariants_bar[p, 2]])
-            out_bar = self.mpm.gradient_bar[p] + tensor.invariants_adjoint(self.mpm.deformation_gradient[s, p], bar)
-            c = ti.Vector([share[p, 0], share[p, 1]])
-            f_bar, c_bar = tensor.neural_flow_adjoint(self.mpm.trial_gradient[s, p], c, out_bar)
-            self.mpm.trial_bar[p] = f_bar
+        """Tables (nodes, 4), (nodes, 2), the two strain scales and the substep [s]; adjoints start at zero."""
+        for n in range(moduli.shape[0]):
+            for a in ti.static(range(4)):
+                self.moduli[n][a] = moduli[n, a]
             for a in ti.static(range(2)):
-                share_bar[p, a] = c_bar[a]
+                self.rates[n][a] = rates[n, a]
+            for t in ti.static(range(self.mpm.chunks)):
+                self.moduli_bar[t, n] = ti.Vector.zero(self.mpm.real, 4)
+                self.rates_bar[t, n] = ti.Vector.zero(self.mpm.real, 2)
+        for p in range(count):
+            self.flow_strain_bar[p] = 0.0
+        self.strains[0] = ti.cast(elastic, self.mpm.real)
+        self.strains[1] = ti.cast(plastic, self.mpm.real)
+        self.substep[None] = ti.cast(dt, self.mpm.real)
 
     @ti.kernel
-    def trial_invariants_adjoint(self, s: ti.i32, bar: ti.types.ndarray()):
-        """The adjoint (N, 3) of the trial invariants -> added to ``trial_bar``."""
-        for p in range(bar.shape[0]):
-            value = ti.Vector([bar[p, 0], bar[p, 1], bar[p, 2]])
-            self.mpm.trial_bar[p] += tensor.invariants_adjoint(self.mpm.trial_gradient[s, p], value)
+    def read_bars(self, moduli: ti.types.ndarray(), rates: ti.types.ndarray(), strain: ti.types.ndarray()):
+        """Adjoints of what ``write_tables`` takes; strain (N,) by particle."""
+        for n in range(moduli.shape[0]):
+            for a in ti.static(range(4)):
+                moduli[n, a] = 0.0
+                for t in ti.static(range(self.mpm.chunks)):
+                    moduli[n, a] += self.moduli_bar[t, n][a]
+            for a in ti.static(range(2)):
+                rates[n, a] = 0.0
+                for t in ti.static(range(self.mpm.chunks)):
+                    rates[n, a] += self.rates_bar[t, n][a]
+        for p in range(strain.shape[0]):
+            strain[p] = self.flow_strain_bar[p]
+
+    # ---- features and the lattice --------------------------------------------------------------------------------
+
+    @ti.func
+    def features(self, invariants, strain):
+        """``masiv.materials.neural.NeuralLaw.features``."""
+        x = invariants[0] / strain
+        square = strain * strain
+        total = invariants[1] + invariants[2]
+        size = ti.abs(x) + ti.sqrt(x * x + 1.0)
+        volume = ti.log(size)
+        if x < 0.0:
+            volume = -volume
+        shear = 0.5 * ti.log(1.0 + ti.max(total, 0.0) / square)
+        return ti.Vector([volume, shear, (invariants[2] - invariants[1]) / (total + square)])
+
+    @ti.func
+    def features_adjoint(self, invariants, strain, bar):
+        """Adjoints of the invariants and of the strain scale."""
+        x = invariants[0] / strain
+        square = strain * strain
+        total, difference = invariants[1] + invariants[2], invariants[2] - invariants[1]
+        root = 1.0 / ti.sqrt(x * x + 1.0)
+        shear = ti.cast(0.0, self.mpm.real)
+        if total > 0.0:
+            shear = 0.5 / (square + total)
+        below = 1.0 / (total + square)
+        along = -bar[2] * difference * below * below
+        out = ti.Vector(
+            [
+                bar[0] * root / strain,
+                bar[1] * shear + along - bar[2] * below,
+                bar[1] * shear + along + bar[2] * below,
+            ]
+        )
+        slope = -bar[0] * root * x / strain - 2.0 * bar[1] * shear * total / strain + 2.0 * strain * along
+        return out, slope
+
+    @ti.func
+    def locate(self, feature):
+        """Lattice cell of a feature vector, position in it, and 1 / step where the feature is within the lattice."""
+        cell = ti.Vector.zero(ti.i32, 3)
+        inside = ti.Vector.zero(self.mpm.real, 3)
+        slope = ti.Vector.zero(self.mpm.real, 3)
+        for a in ti.static(range(3)):
+            u = (feature[a] - LOWER[a]) / STEP
+            if u > 0.0 and u < COUNTS[a] - 1.0:
+                slope[a] = 1.0 / STEP
+            u = ti.min(ti.max(u, 0.0), COUNTS[a] - 1.0)
+            cell[a] = ti.min(ti.cast(u, ti.i32), COUNTS[a] - 2)
+            inside[a] = u - cell[a]
+        return cell, inside, slope
+
+    @ti.func
+    def sample(self, table: ti.template(), zero, cell, inside):
+        out = zero
+        for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
+            weight = (
+                (inside[0] if i else 1.0 - inside[0])
+                * (inside[1] if j else 1.0 - inside[1])
+                * (inside[2] if k else 1.0 - inside[2])
+            )
+            out += weight * table[((cell[0] + i) * COUNTS[1] + cell[1] + j) * COUNTS[2] + cell[2] + k]
+        return out
+
+    @ti.func
+    def sample_adjoint(self, table: ti.template(), table_bar: ti.template(), t: ti.i32, cell, inside, slope, bar):
+        """Scatters to ``table_bar``; returns the adjoint of the features."""
+        out = ti.Vector.zero(self.mpm.real, 3)
+        for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
+            node = ((cell[0] + i) * COUNTS[1] + cell[1] + j) * COUNTS[2] + cell[2] + k
+            x = inside[0] if i else 1.0 - inside[0]
+            y = inside[1] if j else 1.0 - inside[1]
+            z = inside[2] if k else 1.0 - inside[2]
+            value = (x * y * z) * bar
+            if ti.static(self.mpm.gpu):
+                table_bar[t, node] += value
+            else:
+                table_bar[t, node] = table_bar[t, node] + value
+            along = table[node].dot(bar)
+            out += along * ti.Vector([(2 * i - 1) * y * z, (2 * j - 1) * x * z, (2 * k - 1) * x * y])
+        return out * slope
+
+    @ti.func
+    def coefficients(self, table_value):
+        """Interpolated moduli -> c of ``tensor.neural_stress``."""
+        return ti.Vector([ti.exp(table_value[0]), ti.exp(table_value[1]), ti.exp(table_value[2]), table_value[3]])
+
+    @ti.func
+    def share(self, log_rate):
+        """1 - exp(-dt rate), also where that is below the rounding of 1."""
+        x = self.substep[None] * ti.exp(log_rate)
+        return ti.select(x < 0.01, x * (1.0 - 0.5 * x * (1.0 - x / 3.0)), 1.0 - ti.exp(-x))
+
+    # ---- the law -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def particle(self, s: ti.i32, p: ti.i32):
+        trial = self.mpm.trial_gradient[s, p]
+        cell, inside, _ = self.locate(self.features(tensor.invariants(trial), self.strains[1]))
+        f = tensor.neural_flow(
+            trial, self.share(self.sample(self.rates, ti.Vector.zero(self.mpm.real, 2), cell, inside))
+        )
+        cell, inside, _ = self.locate(self.features(tensor.invariants(f), self.strains[0]))
+        c = self.coefficients(self.sample(self.moduli, ti.Vector.zero(self.mpm.real, 4), cell, inside))
+        self.mpm.deformation_gradient[s, p] = f
+        self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(f, c)
+
+    @ti.kernel
+    def forward(self, s: ti.i32, count: ti.i32):
+        for p in range(count):
+            self.particle(s, p)
+
+    @ti.kernel
+    def forward_p2g(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
+        """``forward`` and the P2G of a CPU in one pass."""
+        ti.loop_config(block_dim=1)
+        for t in range(self.mpm.chunks):
+            for n in range(nodes):
+                self.mpm.private[t, n] = ti.Vector.zero(self.mpm.real, 4)
+            for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
+                self.particle(s, p)
+                self.mpm.p2g_particle(t, s, p)
+
+    @ti.func
+    def particle_adjoint(self, t: ti.i32, s: ti.i32, p: ti.i32):
+        f, trial = self.mpm.deformation_gradient[s, p], self.mpm.trial_gradient[s, p]
+        # Stress.
+        final = tensor.invariants(f)
+        cell, inside, slope = self.locate(self.features(final, self.strains[0]))
+        c = self.coefficients(self.sample(self.moduli, ti.Vector.zero(self.mpm.real, 4), cell, inside))
+        f_bar, c_bar = tensor.neural_stress_adjoint(f, c, self.mpm.stress_bar[p])
+        moduli_bar = ti.Vector([c_bar[0] * c[0], c_bar[1] * c[1], c_bar[2] * c[2], c_bar[3]])
+        feature_bar = self.sample_adjoint(self.moduli, self.moduli_bar, t, cell, inside, slope, moduli_bar)
+        invariants_bar, _ = self.features_adjoint(final, self.strains[0], feature_bar)
+        out_bar = self.mpm.gradient_bar[p] + f_bar + tensor.invariants_adjoint(f, invariants_bar)
+        # Flow.
+        before = tensor.invariants(trial)
+        cell, inside, slope = self.locate(self.features(before, self.strains[1]))
+        log_rate = self.sample(self.rates, ti.Vector.zero(self.mpm.real, 2), cell, inside)
+        trial_bar, share_bar = tensor.neural_flow_adjoint(trial, self.share(log_rate), out_bar)
+        x = self.substep[None] * ti.exp(log_rate)
+        feature_bar = self.sample_adjoint(
+            self.rates, self.rates_bar, t, cell, inside, slope, share_bar * x * ti.exp(-x)
+        )
+        invariants_bar, strain_bar = self.features_adjoint(before, self.strains[1], feature_bar)
+        self.mpm.trial_bar[p] = trial_bar + tensor.invariants_adjoint(trial, invariants_bar)
+        self.flow_strain_bar[p] += strain_bar
+
+    @ti.kernel
+    def backward(self, s: ti.i32, count: ti.i32):
+        """``gradient_bar`` and ``stress_bar`` -> ``trial_bar``; adjoints of the tables are added up."""
+        if ti.static(self.mpm.gpu):
+            for p in range(count):
+                self.particle_adjoint(0, s, p)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.mpm.chunks):
+                for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
+                    self.particle_adjoint(t, s, p)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from masiv.materials import table
 from masiv.materials.law import BoundLaw, Law
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ def strain_invariants(deformation_gradient: torch.Tensor) -> torch.Tensor:
 
 class NeuralLaw(Law):
     """Two networks 3 -> width -> width -> coefficients, and two scales learnt as logarithms.
+
+    The networks are known by their values on a lattice of strain features, between whose nodes the law is interpolated.
 
     The elastic network gives log moduli relative to the stress scale [Pa], the plastic one log relaxation rates [1/s]
     of strains relative to the flow strain: moving the two scales makes another stiffness and another yield strain of
@@ -68,17 +71,26 @@ class NeuralLaw(Law):
         sort = (second - first) / (first + second + square)
         return torch.stack([torch.asinh(volume / strain), 0.5 * size, sort], dim=1)
 
+    def moduli_table(self) -> torch.Tensor:
+        """ln g1, ln g2, ln kappa and coupling [Pa] at the nodes of ``masiv.materials.table``, (K, 4)."""
+        raw = self.elastic(table.nodes(self.log_stress_scale.dtype))
+        bounded = LOG_MODULUS_RANGE * torch.tanh(raw[:, :3] / LOG_MODULUS_RANGE)
+        coupling = torch.exp(self.log_stress_scale) * torch.tanh(raw[:, 3:])
+        return torch.cat([self.log_stress_scale + bounded, coupling], dim=1)
+
+    def rate_table(self) -> torch.Tensor:
+        """Logarithms of the isochoric and volumetric relaxation rate [1/s] at the nodes, (K, 2)."""
+        return LOG_RATE_RANGE * torch.tanh(self.plastic(table.nodes(self.log_stress_scale.dtype)) / LOG_RATE_RANGE)
+
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
         """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
-        raw = self.elastic(self.features(invariants, STRAIN_SCALE))
-        bounded = LOG_MODULUS_RANGE * torch.tanh(raw[:, :3] / LOG_MODULUS_RANGE)
-        return torch.exp(self.log_stress_scale) * torch.cat([torch.exp(bounded), torch.tanh(raw[:, 3:])], dim=1)
+        value = table.interpolate(self.moduli_table(), self.features(invariants, STRAIN_SCALE))
+        return torch.cat([torch.exp(value[:, :3]), value[:, 3:]], dim=1)
 
     def flow_share(self, invariants: torch.Tensor, dt: float) -> torch.Tensor:
         """Shares (N, 2) of the isochoric and volumetric elastic strain that flow within dt [s]."""
-        raw = self.plastic(self.features(invariants, torch.exp(self.log_flow_strain)))
-        rate = torch.exp(LOG_RATE_RANGE * torch.tanh(raw / LOG_RATE_RANGE))
-        return -torch.expm1(-dt * rate)
+        log_rate = table.interpolate(self.rate_table(), self.features(invariants, torch.exp(self.log_flow_strain)))
+        return -torch.expm1(-dt * torch.exp(log_rate))
 
     def project(self, trial_gradient: torch.Tensor, dt: float) -> torch.Tensor:
         share = self.flow_share(strain_invariants(trial_gradient), dt)
@@ -149,46 +161,46 @@ def _neural_kernels(mpm):
 
 
 class _BoundNeural(BoundLaw):
-    """The networks in torch between two kernels: invariants out, coefficients in."""
+    """The networks run once here; kernels interpolate their tables."""
 
     def __init__(self, law: NeuralLaw, mpm: MpmKernels, count: int, dt: float) -> None:
-        self.law = law
         self.dt = dt
         self.kernels = _neural_kernels(mpm)
-        self.dtype = law.log_stress_scale.dtype
+        self.count = count
         self.parameters = tuple(law.parameters())
-        self.gradients = [torch.zeros_like(p) for p in self.parameters]
-        self.trial_invariants = torch.empty(count, 3, dtype=self.dtype)
-        self.invariants = torch.empty(count, 3, dtype=self.dtype)
-        self.share_bar = torch.empty(count, 2, dtype=self.dtype)
-        self.moduli_bar = torch.empty(count, 4, dtype=self.dtype)
+        with torch.enable_grad():
+            self.tables = (law.moduli_table(), law.rate_table(), torch.exp(law.log_flow_strain))
+        self.dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
+        self._write()
+
+    def _write(self) -> None:
+        moduli, rates = (t.detach().to(self.dtype).contiguous() for t in self.tables[:2])
+        flow_strain = float(self.tables[2].detach())
+        self.kernels.write_tables(moduli, rates, STRAIN_SCALE, flow_strain, self.dt, self.count)
+        self.kernels.owner = self
+
+    def _own(self) -> None:
+        if self.kernels.owner is not self:  # another rollout used the same fields since
+            self._write()
 
     def forward(self, s: int, count: int) -> None:
-        with torch.no_grad():
-            self.kernels.trial_invariants(s, self.trial_invariants)
-            self.kernels.flow(s, self.law.flow_share(self.trial_invariants, self.dt), self.invariants)
-            self.kernels.elastic(s, self.law.moduli(self.invariants))
+        self._own()
+        self.kernels.forward(s, count)
+
+    def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
+        if mpm.gpu:
+            super().p2g(mpm, s, count, nodes)
+        else:
+            self._own()
+            self.kernels.forward_p2g(s, count, nodes)
 
     def backward(self, s: int, count: int) -> None:
-        k = self.kernels
-        k.elastic_invariants(s, self.invariants)
-        k.trial_invariants(s, self.trial_invariants)
-        final = self.invariants.clone().requires_grad_()
-        moduli = self.law.moduli(final)
-        k.elastic_adjoint(s, moduli.detach(), self.moduli_bar)
-        final_bar = self._through(moduli, final, self.moduli_bar)
-        trial = self.trial_invariants.clone().requires_grad_()
-        share = self.law.flow_share(trial, self.dt)
-        k.flow_adjoint(s, share.detach(), final_bar, self.share_bar)
-        k.trial_invariants_adjoint(s, self._through(share, trial, self.share_bar))
-
-    def _through(self, output: torch.Tensor, invariants: torch.Tensor, bar: torch.Tensor) -> torch.Tensor:
-        """Adjoint of the invariants; gradients of the weights are added up."""
-        bars = torch.autograd.grad(output, (invariants, *self.parameters), bar, allow_unused=True)
-        for total, part in zip(self.gradients, bars[1:], strict=True):
-            if part is not None:
-                total += part
-        return bars[0]
+        self._own()
+        self.kernels.backward(s, count)
 
     def parameter_gradients(self) -> tuple[torch.Tensor | None, ...]:
-        return tuple(self.gradients)
+        bars = [torch.empty(len(self.tables[0]), width, dtype=self.dtype) for width in (4, 2)]
+        strain = torch.empty(self.count, dtype=self.dtype)
+        self.kernels.read_bars(*bars, strain)
+        bars = [bar.to(t.dtype) for bar, t in zip([*bars, strain.double().sum()], self.tables, strict=True)]
+        return torch.autograd.grad(self.tables, self.parameters, bars)

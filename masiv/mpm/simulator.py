@@ -77,12 +77,12 @@ class Simulator:
         self.constants = {
             "substep": substep,
             "spacing": spacing,
-            "mass": density * volume / particle_count,
             "volume": volume / particle_count,
             "gravity": tuple(float(g) for g in gravity),
             "friction": friction,
             "contact": CONTACTS.index(contact),
         }
+        self.mass = torch.full((particle_count,), density * volume / particle_count, dtype=dtype)
         real = "f64" if dtype == torch.float64 else "f32"
         particles = _round_up(particle_count, 1024)
         bytes_a_step = particles * 42 * (8 if real == "f64" else 4)
@@ -104,9 +104,10 @@ class Simulator:
     def apply_constants(self) -> None:
         """Write this simulator's constants to the fields, which simulators of the same capacity share."""
         c = self.constants
-        values = [c["substep"], c["spacing"], c["mass"], c["volume"], *c["gravity"], c["friction"]]
+        values = [c["substep"], c["spacing"], c["volume"], *c["gravity"], c["friction"]]
         for index, value in enumerate(values):
             self.k.constants[index] = value
+        self.k.write_mass(self.mass)
         self.k.contact[None] = c["contact"]
 
     def window(self, s: int, reckless: bool) -> tuple[int, ...]:
@@ -147,6 +148,7 @@ class Recording:
         self.segment = min(simulator.k.capacity_steps, steps)
         self.starts: list[State] = []
         self.windows: dict[int, tuple[int, ...]] = {}
+        self.logs = {0: simulator.k.capacity_nodes}  # local substep where a window begins -> its first log entry
         self.positions = torch.empty(len(outputs), simulator.count, 3, dtype=simulator.dtype)
 
     def forward(self, initial: State) -> None:
@@ -181,8 +183,9 @@ class Recording:
             k.clear_fault()
             for s in range(begin, end):
                 self.bound.p2g(k, s, sim.count, nodes)
-                k.grid_update(nodes)
+                k.grid_update(self._log(s, nodes))
                 k.g2p(s, sim.count)
+            self.logs[end] = self.logs[begin] + (end - begin) * nodes
             too_fast, outside = k.read_fault()
             if too_fast >= 0:
                 raise NonFiniteError(
@@ -191,6 +194,12 @@ class Recording:
             if outside < 0:
                 return
         raise NonFiniteError(start + (outside >> 32), outside & 0xFFFFFFFF, "non-finite position")
+
+    def _log(self, s: int, nodes: int) -> int:
+        """Where the grid of local substep s is kept for the adjoint, or 0 (scratch) where the log is full."""
+        begin = s - s % WINDOW_EVERY
+        offset = self.logs[begin] + (s - begin) * nodes
+        return offset if offset + nodes <= self.simulator.k.capacity_log else 0
 
     def _collect(self, start: int, length: int, first: bool) -> None:
         for s in range(0 if first else 1, length + 1):
@@ -228,10 +237,14 @@ class Recording:
                 window = self.windows[start + s - s % WINDOW_EVERY]
                 if window is not current:
                     nodes, current = sim.set_window(window), window
-                k.p2g(s, sim.count, nodes)
-                k.grid_update(nodes)
+                offset = self._log(s, nodes)
+                if offset:
+                    k.grid_velocities(offset)
+                else:
+                    k.p2g(s, sim.count, nodes)
+                    k.grid_update(offset)
                 k.g2p_adjoint(s, sim.count, nodes)
-                k.grid_adjoint(nodes)
+                k.grid_adjoint(offset)
                 k.p2g_adjoint(s, sim.count)
                 self.bound.backward(s, sim.count)
         if 0 in self.outputs:
