@@ -232,6 +232,7 @@ BAD_TRANSFORMS = [
     (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(3, float("nan")), "finite numbers"),
     (lambda d: d["frames"][1]["transform_matrix"][0].__setitem__(0, 3.0), "frame 1: .*not a rotation"),
     (lambda d: d["frames"].append({**d["frames"][0], "file_path": d["frames"][1]["file_path"]}), "two pictures of one"),
+    (lambda d: [f.update(time=f["time"] - 0.06) for f in d["frames"]], "second picture of its view before time 0"),
     (lambda d: d.update(frames=[]), r"transforms\.json: 'frames' must be a list"),
 ]
 

@@ -50,11 +50,14 @@ def test_simulation_frame_round_trip(up, height, points):
     np.testing.assert_allclose(frame.points_to_simulation(points)[:, 1], heights, atol=1e-8)
 
 
-@pytest.mark.parametrize("up", [[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 1e-7]])
+@pytest.mark.parametrize(
+    "up", [[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 1e-7], [1e-5, -1, 0], [0.01, -1, 0.01]]
+)
 def test_up_goes_to_y(up):
     frame = SimulationFrame.from_scene(np.array(up, float), None)
     unit = np.array(up) / np.linalg.norm(up)
-    np.testing.assert_allclose(frame.vectors_to_simulation(unit), [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(frame.vectors_to_simulation(unit), [0, 1, 0], atol=1e-11)
+    np.testing.assert_allclose(frame.rotation @ frame.rotation.T, np.eye(3), atol=1e-11)
     assert np.linalg.det(frame.rotation) == pytest.approx(1)
 
 

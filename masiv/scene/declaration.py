@@ -51,7 +51,7 @@ class SceneDeclaration(BaseModel):
         value = default if self.up_axis is None else self.up_axis
         if isinstance(value, str):
             sign = -1.0 if value.startswith("-") else 1.0
-            return sign * np.array(AXES[value.lstrip("-")])
+            return sign * np.array(AXES[value.lstrip("-")]) + 0.0  # + 0.0 turns −0 into 0
         return _unit(value, "up_axis")
 
     def gravity_vector(self, up: np.ndarray, default: float) -> np.ndarray:

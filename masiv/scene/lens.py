@@ -128,7 +128,7 @@ def lens_of(row: Mapping[str, Any], width: int, height: int, where: str) -> Lens
 
 
 def _coefficients(row: Mapping[str, Any], where: str) -> np.ndarray:
-    model = row.get("camera_model", "OPENCV")
+    model = str(row.get("camera_model", "OPENCV"))
     if model not in MODELS or row.get("is_fisheye"):
         raise InputError(
             f"{where}: camera_model is {'fisheye' if model in MODELS else model!r}, known are {', '.join(MODELS)}: "

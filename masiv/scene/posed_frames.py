@@ -124,8 +124,12 @@ class _Views:
         view = next(same, len(self.members))
         if view == len(self.members):
             self.members.append([])
-        if frame is None:  # before the first frame
-            self.backgrounds[view] = picture.path
+        if frame is None:  # before time 0
+            if self.backgrounds.setdefault(view, picture.path) != picture.path:
+                raise InputError(
+                    f"{picture.where} is a second picture of its view before time 0: one is the empty background, "
+                    "the motion begins at 0"
+                )
         elif (other := self.at.get((view, frame))) is None:
             self.at[view, frame] = picture
         elif other.path != picture.path:

@@ -96,9 +96,10 @@ class TimeGrid:
             )
         if index[-1] >= len(instants):
             gap = int(np.flatnonzero(np.diff(index) > 1)[0])
+            before, after = (names[int(order[k])] for k in starts[gap : gap + 2])
             raise InputError(
-                f"no view has a picture at frame {index[gap] + 1}, between {names[order[starts[gap]]]} and "
-                f"{names[order[starts[gap + 1]]]}: frames must run without gaps"
+                f"no view has a picture at frame {index[gap] + 1}, between {before} and {after}: "
+                "frames must run without gaps"
             )
         rate = fps or whole_if_near(1 / step)
         return cls(float(first), float(step), len(instants), float(rate), tolerance)
@@ -166,8 +167,10 @@ class SimulationFrame:
 def _rotation_to_y(unit: np.ndarray) -> np.ndarray:
     target = np.array([0.0, 1.0, 0.0])
     cosine = float(unit @ target)
-    if cosine < -1.0 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])  # half a turn about x: the smallest rotation is not unique there
+    if cosine < -1.0 + 1e-4:
+        # The smallest rotation is not unique at −y and ill-conditioned near it: half a turn about x, then the small rest.
+        half_turn = np.diag([1.0, -1.0, -1.0])
+        return _rotation_to_y(half_turn @ unit) @ half_turn
     cross = np.cross(unit, target)
     skew = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
     return np.eye(3) + skew + skew @ skew / (1.0 + cosine)
