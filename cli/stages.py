@@ -12,6 +12,7 @@ from masiv.config import Config, load_config
 from masiv.errors import InputError
 from masiv.progress import Progress
 from masiv.report.history import logged
+from masiv.report.material import MATERIAL
 from masiv.runfolder import Request, RunFolder
 from masiv.scene.read import read_scene
 from masiv.scene.scene import Scene
@@ -108,13 +109,16 @@ def estimated(run: RunFolder, config: Config, scene: Scene, progress: Progress) 
 
 
 def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Twin:
-    """The run's twin, made now where it lacks it."""
+    """The run's twin, made now where it lacks it, with material.json: what its law is in a tester's terms."""
     runtime.start(config.arch)
     from masiv.identify.stage import identify
     from masiv.twin import Twin
 
     if run.done("identify"):
-        return Twin.load(run.path)
+        twin = Twin.load(run.path)
+        if not (run.path / MATERIAL).is_file():
+            _describe(run, twin, progress)
+        return twin
     trajectory = estimated(run, config, scene, progress)
     with run.stage("identify") as checkpoint:
         twin = identify(
@@ -127,7 +131,15 @@ def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress)
             progress=logged(progress, run.log),
         )
         twin.save(run.path)
+        _describe(run, twin, progress)
     return twin
+
+
+def _describe(run: RunFolder, twin: Twin, progress: Progress) -> None:
+    from masiv.materials.describe import describe_twin
+
+    positions = load_trajectory(run).positions
+    describe_twin(twin, frames=run.fit_frames, trajectory=positions, progress=progress).save(run.path / MATERIAL)
 
 
 def varied(

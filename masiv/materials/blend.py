@@ -10,6 +10,7 @@ import torch
 
 from masiv.errors import InputError, MasivError
 from masiv.materials.classical import ClassicalLaw
+from masiv.materials.curves import tabulated
 from masiv.materials.law import BoundLaw, Law
 from masiv.materials.neural import NeuralLaw
 
@@ -118,26 +119,24 @@ def _between(first: ClassicalLaw, second: ClassicalLaw, weight: float) -> dict[s
 
 @functools.lru_cache(maxsize=8)
 def _kernels(mpm):
-    from masiv.kernels.neural import NeuralKernels
+    from masiv.kernels.pointwise import PointwiseKernels
 
-    return NeuralKernels(mpm)
+    return PointwiseKernels(mpm)
 
 
 class _BoundBlend(BoundLaw):
-    """The two laws' coefficients in torch between the kernels of the neural law."""
+    """The definition itself, in torch, between the fields of the simulator."""
 
     def __init__(self, law: BlendedLaw, mpm: MpmKernels, count: int, dt: float) -> None:
-        self.law, self.dt = law, dt
-        self.kernels = _kernels(mpm)
-        dtype = law.first.log_stress_scale.dtype
-        self.trial_invariants = torch.empty(count, 3, dtype=dtype)
-        self.invariants = torch.empty(count, 3, dtype=dtype)
+        self.kernels, self.dt = _kernels(mpm), dt
+        self.law = BlendedLaw(tabulated(law.first), tabulated(law.second), law.weight)
+        self.trial = torch.empty(count, 3, 3, dtype=law.first.log_stress_scale.dtype)
 
     def forward(self, s: int, count: int) -> None:
         with torch.no_grad():
-            self.kernels.trial_invariants(s, self.trial_invariants)
-            self.kernels.flow(s, self.law.flow_share(self.trial_invariants, self.dt), self.invariants)
-            self.kernels.elastic(s, self.law.moduli(self.invariants))
+            self.kernels.read_trial(s, self.trial)
+            gradient = self.law.project(self.trial, self.dt)
+            self.kernels.write(s, gradient, self.law.stress(gradient))
 
     def backward(self, s: int, count: int) -> None:
         raise MasivError("a blended law has no adjoint: it is simulated, not fitted")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from masiv import metrics
 from masiv.progress import Progress, silent
 from masiv.report import measure
 from masiv.report.follow import Binding
+from masiv.report.material import read_material
 from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
 
@@ -57,6 +59,7 @@ def run_numbers(
     run: RunFolder, scene: Scene, dynamic: DynamicGaussians, trajectory: Trajectory, rollout: np.ndarray
 ) -> dict[str, Any]:
     """metrics.json of ``masiv identify``: no ground truth is needed."""
+    material = read_material(run.path)
     return {
         "schema": 1,
         "units": measure.UNITS,
@@ -69,6 +72,7 @@ def run_numbers(
             "volume_m3": float(trajectory.volume),
         },
         "seconds": run.seconds(),
+        **({} if material is None else {"material": {"summary": material["summary"]}}),
     }
 
 
@@ -159,7 +163,11 @@ def table(numbers: Mapping[str, Any]) -> str:
     widths = [max(len(row[column]) for row in cells) for column in range(len(header))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
     floor = numbers.get("chamfer_floor_1e3mm2")
-    return "\n".join(lines + ([] if floor is None else [f"floor of Chamfer by sampling: {floor:.3g} 10³ mm²"]))
+    if floor is not None:
+        lines.append(f"floor of Chamfer by sampling: {floor:.3g} 10³ mm²")
+    if "material" in numbers:
+        lines.append("\n".join(textwrap.wrap(numbers["material"]["summary"], 110)))
+    return "\n".join(lines)
 
 
 def _span(indices: list[int] | None) -> str | None:

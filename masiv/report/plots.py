@@ -102,6 +102,24 @@ def law_curves(law: Any) -> bytes:
     return _png(figure)
 
 
+def material_curves(curves: Mapping[str, Mapping[str, Any]]) -> bytes:
+    """Stress over strain, a panel a curve of ``masiv.materials.describe.Material``; grey beyond what was observed."""
+    figure, axes = _figure(len(curves))
+    for axis, (name, curve) in zip(axes, curves.items(), strict=True):
+        strain, stress = np.asarray(curve["strain"]), np.asarray(curve["stress_pa"]) / 1e3
+        low, high = curve["observed"]
+        seen = (strain >= low) & (strain <= high)
+        axis.plot(strain, stress, color=GREY, linewidth=1)
+        axis.plot(strain, np.where(seen, stress, np.nan), color=BLUE, linewidth=2, label="identified, observed")
+        if curve["family_pa"] is not None:
+            family = np.asarray(curve["family_pa"]) / 1e3
+            axis.plot(strain, family, color=ORANGE, linewidth=1, linestyle="--", label="nearest classical law")
+        axis.set(title=name.replace(", there", ",\nthere"), xlabel="strain", ylabel="Kirchhoff stress [kPa]")
+        axis.axhline(0, color=GREY, linewidth=0.5)
+    axes[0].legend(frameon=False, fontsize=8)
+    return _png(figure)
+
+
 def _mark_fit(axis: Any, where: float | None, label: str) -> None:
     if where is not None:
         axis.axvline(where, color=GREY, linestyle="--", linewidth=1)

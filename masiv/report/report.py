@@ -16,6 +16,7 @@ from masiv.report.draw import draw, on_black
 from masiv.report.film import joined
 from masiv.report.follow import Binding
 from masiv.report.history import curves
+from masiv.report.material import material_section, read_material
 from masiv.report.media import write_video
 from masiv.report.numbers import rows
 from masiv.report.page import Page
@@ -60,7 +61,11 @@ def write_report(
     page.note("PSNR and SSIM: object on black. 'to trajectory' is what the fit made small, no ground truth.")
     page.heading("The twin")
     page.table(["quantity", "value", "unit"], _twin_rows(twin))
-    page.picture(plots.law_curves(twin.law), "stress of the identified law")
+    material = read_material(run.path)
+    if material is None:
+        page.picture(plots.law_curves(twin.law), "stress of the identified law")
+    else:
+        material_section(page, material)
     page.heading("Motion")
     fit_end = (run.fit_frames - 1) / scene.fps
     motions = {"trajectory": (trajectory.positions, trajectory.times), "twin": (rollout, scene.times)}

@@ -1,0 +1,188 @@
+"""What a motion says of a law: the strains that it excited, and how far it would move if the law were another."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from masiv.errors import InputError, NonFiniteError
+from masiv.materials.classical import ClassicalLaw
+from masiv.materials.curves import deviatoric_strain, moduli_at_rest
+from masiv.materials.law import Law
+from masiv.materials.neural import NeuralLaw
+
+if TYPE_CHECKING:
+    from masiv.mpm.simulator import State
+
+NEIGHBOURS, SAMPLE = 12, 1500
+STEP = 1.1
+"""A tenth: the change of the finite difference."""
+FAINT = 0.1
+"""A change that moves the body by less than this share of the fit's error is not excited."""
+
+
+@dataclass(frozen=True)
+class Excited:
+    """Over particles and frames: 1st and 99th percentile of the equivalent deviatoric Hencky strain that is elastic, of
+    the whole one since frame 0, and of the elastic ln J; 90th percentile of the deviatoric strain rate [1/s]."""
+
+    elastic_strain: tuple[float, float]
+    strain: tuple[float, float]
+    log_volume: tuple[float, float]
+    rate: float
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """moved_mm: RMS over particles and frames for 10 % more of it; None where the law lacks it or the motion diverged.
+
+    stderr_percent: from the fit's error, the others that are excited fitted with it, the launch held. None where it is
+    not excited or cannot be told from another.
+    """
+
+    name: str
+    moved_mm: float | None
+    excited: bool
+    stderr_percent: float | None
+
+
+def excited_range(states: Iterable[State]) -> Excited:
+    """What the states of a rollout, one a frame, went through. Raises InputError where there is no frame after 0."""
+    elastic, whole, volume, rates = [], [], [], []
+    rest, index = None, None
+    for state in states:
+        if rest is None or index is None:
+            rest = state.position.double().numpy()
+            chosen = np.linspace(0, len(rest) - 1, min(SAMPLE, len(rest))).round().astype(int)
+            index = cKDTree(rest).query(rest[chosen], k=min(NEIGHBOURS, len(rest)))[1]
+            continue
+        gradient = state.trial_gradient.double()
+        elastic.append(deviatoric_strain(gradient))
+        volume.append(torch.log(torch.linalg.det(gradient)))
+        whole.append(deviatoric_strain(_whole_gradient(rest[index], state.position.double().numpy()[index])))
+        rate = 0.5 * (state.affine_velocity + state.affine_velocity.mT).double()
+        rate = rate - rate.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(3).double()
+        rates.append((2 / 3) ** 0.5 * rate.norm(dim=(1, 2)))
+    if not elastic:
+        raise InputError("a material is described from at least two frames of its motion")
+
+    def span(parts: list[torch.Tensor]) -> tuple[float, float]:
+        low, high = np.percentile(torch.cat(parts).numpy(), [1, 99])
+        return float(low), float(high)
+
+    return Excited(span(elastic), span(whole), span(volume), float(np.percentile(torch.cat(rates).numpy(), 90)))
+
+
+def _whole_gradient(rest: np.ndarray, now: np.ndarray) -> torch.Tensor:
+    """Least-squares gradients (M, 3, 3) that take neighbourhoods (M, k, 3) [m] from ``rest`` to ``now``."""
+    before, after = rest - rest.mean(1, keepdims=True), now - now.mean(1, keepdims=True)
+    spread = np.einsum("mki,mkj->mij", before, before)
+    ridge = 1e-9 * np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    f = torch.as_tensor(np.einsum("mki,mkj->mij", after, before) @ np.linalg.inv(spread + ridge))
+    return f[torch.linalg.det(f) > 0]
+
+
+def perturbed(law: Law, factor: float = STEP) -> dict[str, Law]:
+    """``law`` with one property at a time ``factor`` of what it is: those that its kind has, by name."""
+    if isinstance(law, NeuralLaw):
+        return {
+            "shear modulus": _nudged(law, lambda new: new.elastic[-1].bias[:2].add_(math.log(factor))),
+            "bulk modulus": _nudged(law, lambda new: new.elastic[-1].bias[2:3].add_(math.log(factor))),
+            "flow strain": _nudged(law, lambda new: new.log_flow_strain.add_(math.log(factor))),
+            "relaxation time": _nudged(law, lambda new: new.plastic[-1].bias.sub_(math.log(factor))),
+        }
+    if not isinstance(law, ClassicalLaw):
+        return {}
+    values = {name: float(value) for name, value in law.values.items()}
+    changed: dict[str, dict[str, float]] = {}
+    if {"youngs_modulus", "poissons_ratio"} <= values.keys():
+        shear, bulk = _shear_and_bulk(values)
+        if law.kind != "water":
+            changed["shear modulus"] = _elastic(factor * shear, bulk)
+        changed["bulk modulus"] = _elastic(shear, factor * bulk)
+        if law.kind == "water":  # its one modulus is Lamé's lambda
+            changed["bulk modulus"] = {"youngs_modulus": factor * values["youngs_modulus"]}
+    for name, value in values.items():
+        if name not in ("youngs_modulus", "poissons_ratio"):
+            changed[name.replace("_", " ")] = {name: factor * value}
+    return {name: ClassicalLaw(law.kind, **(values | change)) for name, change in changed.items()}
+
+
+def _nudged(law: NeuralLaw, change: Callable[[NeuralLaw], object]) -> NeuralLaw:
+    new = copy.deepcopy(law)
+    with torch.no_grad():
+        change(new)
+    return new
+
+
+def _shear_and_bulk(values: dict[str, float]) -> tuple[float, float]:
+    young, poisson = values["youngs_modulus"], values["poissons_ratio"]
+    return young / (2 * (1 + poisson)), young / (3 * (1 - 2 * poisson))
+
+
+def _elastic(shear: float, bulk: float) -> dict[str, float]:
+    return {
+        "youngs_modulus": 9 * bulk * shear / (3 * bulk + shear),
+        "poissons_ratio": (3 * bulk - 2 * shear) / (2 * (3 * bulk + shear)),
+    }
+
+
+def sensitivities(
+    reroll: Callable[[Law], np.ndarray], law: Law, *, error_mm: float, residual: np.ndarray | None = None
+) -> list[Sensitivity]:
+    """How well a motion determines the properties of ``law``.
+
+    reroll: a law -> positions (T, Q, 3) [m] of the motion that it makes, frame 0 included. error_mm: of the fit, RMS
+    over particles. residual (T - 1, Q, 3): its shape tells how many of the data are independent (participation ratio of
+    its singular values); without it, each frame counts as one.
+    """
+    base = reroll(law)[1:].astype(np.float64)
+    moved: dict[str, np.ndarray | None] = {}
+    for name, other in perturbed(law).items():
+        try:
+            moved[name] = 1e3 * (reroll(other)[1:] - base) * _to_a_tenth(law, other, name)
+        except NonFiniteError:
+            moved[name] = None
+    size = {name: None if d is None else float(np.sqrt((d**2).sum(2).mean())) for name, d in moved.items()}
+    felt = [name for name, value in size.items() if value is not None and value >= FAINT * error_mm]
+    stderr = _standard_errors([moved[name] for name in felt], error_mm, _independent(residual, len(base)))
+    by_name = dict(zip(felt, stderr, strict=True))
+    return [Sensitivity(name, value, name in felt, by_name.get(name)) for name, value in size.items()]
+
+
+def _to_a_tenth(law: Law, other: Law, name: str) -> float:
+    """What scales the change that was made to 10 %: the networks' outputs are bounded, so a nudge is not all felt."""
+    if name not in ("shear modulus", "bulk modulus") or not isinstance(law, NeuralLaw):
+        return 1.0
+    which = 0 if name == "shear modulus" else 1
+    made = math.log(moduli_at_rest(other)[which] / moduli_at_rest(law)[which])
+    return math.log(STEP) / made if made > 1e-3 else 1.0
+
+
+def _independent(residual: np.ndarray | None, frames: int) -> float:
+    if residual is None or not np.any(residual):
+        return float(frames)
+    power = np.linalg.svd(residual.reshape(len(residual), -1), compute_uv=False) ** 2
+    return float(power.sum() ** 2 / (power**2).sum())
+
+
+def _standard_errors(moved: list[np.ndarray | None], error_mm: float, independent: float) -> list[float | None]:
+    columns = np.stack([d.ravel() for d in moved if d is not None], 1) if moved else np.zeros((1, 0))
+    gram = 3 * columns.T @ columns / max(len(columns), 1)  # mean over particles of the dot product
+    scale = np.sqrt(np.diag(gram))
+    if len(gram) == 0:
+        return []
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    told_apart = values > 1e-4
+    # A direction that the data do not see leaves those that take part in it unknown.
+    unknown = (vectors[:, ~told_apart] ** 2).sum(1) > 0.05
+    inverse = (vectors[:, told_apart] / values[told_apart]) @ vectors[:, told_apart].T
+    stderr = 10 * error_mm * np.sqrt(np.diag(inverse) / independent) / scale
+    return [None if u else float(e) for u, e in zip(unknown, stderr, strict=True)]
