@@ -168,7 +168,7 @@ def _rotation_to_y(unit: np.ndarray) -> np.ndarray:
     target = np.array([0.0, 1.0, 0.0])
     cosine = float(unit @ target)
     if cosine < -1.0 + 1e-4:
-        # The smallest rotation is not unique at −y and ill-conditioned near it: half a turn about x, then the small rest.
+        # The smallest rotation is not unique at −y and ill-conditioned near it: half a turn about x, then the rest.
         half_turn = np.diag([1.0, -1.0, -1.0])
         return _rotation_to_y(half_turn @ unit) @ half_turn
     cross = np.cross(unit, target)
