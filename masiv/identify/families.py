@@ -119,11 +119,12 @@ def law_of(family: Family, values: dict[str, float]) -> ClassicalLaw:
 class Rollouts:
     """Residuals of ``values`` (law and throw) over the first ``frames``: (K, N, 3) [m], simulated less observed.
 
-    The number of substeps is held while a law's stiffness changes little, and never falls: a residual that jumped with
-    it would be mistaken for a derivative.
+    All take the number of substeps that the first law needs, softer ones too: what a grid loses depends on it by
+    millimetres, and a jump would be mistaken for a derivative. A law too stiff for it is refused, as one that diverges.
     """
 
-    HEADROOM = 1.12
+    STABLE = 1.4
+    """Substeps that a law may need over those taken: the configured Courant number leaves as much."""
 
     def __init__(self, problem: Problem, family: Family, contact: str, frames: int) -> None:
         self.problem = problem
@@ -137,10 +138,11 @@ class Rollouts:
         """Raises NonFiniteError where the rollout diverges, spreads without bound or is too stiff to be simulated."""
         law = law_of(self.family, values)
         try:
-            needed = self.problem.substeps(law)
-            if needed * self.HEADROOM**0.5 > self.steps:
-                unit = 8 * self.problem.samples
-                self.steps = -(-int(needed * self.HEADROOM) // unit) * unit
+            if self.steps == 0:
+                self.steps = self.problem.substeps(law)
+            needed = self.problem.least_substeps(law)
+            if needed > self.STABLE * self.steps:
+                raise NonFiniteError(0, 0, f"the law needs {needed} substeps a frame, {self.steps} are taken")
             positions = self.problem.run(law, motion_of(values), self.contact, self.frames, steps=self.steps)
         except (InputError, NonFiniteError):
             raise

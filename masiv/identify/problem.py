@@ -75,7 +75,12 @@ class Problem:
 
     def substeps(self, law: Law) -> int:
         """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number."""
-        count = substeps_per_frame(
+        unit = 8 * self.samples
+        return -(-self.least_substeps(law) // unit) * unit
+
+    def least_substeps(self, law: Law) -> int:
+        """The fewest substeps in a frame that ``law`` is stable with. Raises MasivError where those are too many."""
+        return substeps_per_frame(
             spacing=self.spacing,
             wave_modulus=law.wave_modulus(),
             density=self.scene.density,
@@ -83,8 +88,6 @@ class Problem:
             frame_time=1 / self.scene.fps,
             config=self.simulator,
         )
-        unit = 8 * self.samples
-        return -(-count // unit) * unit
 
     def run(self, law: Law, motion: Motion, contact: str, frames: int, steps: int | None = None) -> torch.Tensor:
         """Positions (frames * samples, N, 3) [m, simulation frame of the scene], differentiable. steps: substeps a
