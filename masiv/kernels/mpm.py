@@ -77,6 +77,7 @@ class MpmKernels:
         self.capacity_log = capacity_nodes + capacity_steps * max(4096, capacity_particles)
         self.grid_momentum = ti.Vector.field(4, real, shape=self.capacity_log)
         self.grid_velocity = ti.Vector.field(4, real, shape=capacity_nodes)  # the fourth pads: one aligned load
+        self.grid_velocity_bar = ti.Vector.field(3, real, shape=capacity_nodes)
         self.grid_momentum_bar = ti.Vector.field(4, real, shape=capacity_nodes)
         self.constants = ti.field(real, shape=CONSTANT_COUNT)
         self.contact = ti.field(ti.i32, shape=())
@@ -508,6 +509,11 @@ class MpmKernels:
     def write_mass(self, mass: ti.types.ndarray()):
         for p in range(mass.shape[0]):
             self.particle_mass[p] = mass[p]
+
+    @ti.kernel
+    def read_mass_bar(self, out: ti.types.ndarray()):
+        for p in range(out.shape[0]):
+            out[p] = self.mass_bar[p]
 
     @ti.kernel
     def read_position(self, s: ti.i32, position: ti.types.ndarray()):

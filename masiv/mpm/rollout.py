@@ -4,33 +4,70 @@ from __future__ import annotations
 
 import torch
 
+from masiv.effects.active import ActiveEffects
 from masiv.materials.law import Law
 from masiv.mpm.simulator import Simulator, State
 
 
 class _Rollout(torch.autograd.Function):
+    """Inputs after the plain arguments: state (4 tensors), the law's parameters, parameters of each effect."""
+
     @staticmethod
-    def forward(ctx, simulator, law, steps, outputs, position, velocity, affine_velocity, trial_gradient, *parameters):
+    def forward(
+        ctx, simulator, law, steps, outputs, effects, position, velocity, affine_velocity, trial_gradient, *rest
+    ):
         state = State(position, velocity, affine_velocity, trial_gradient)
-        ctx.recording = simulator.run(state, law, steps, outputs)
+        with torch.enable_grad():  # from parameters of effects to coefficients of kernels
+            ctx.effects = _leaves(effects) if effects is not None else None
+            ctx.recording = simulator.run(state, law, steps, outputs, ctx.effects)
         ctx.dtypes = [t.dtype for t in state.tensors()]
         return ctx.recording.positions
 
     @staticmethod
     def backward(ctx, positions_bar):
         with torch.enable_grad():  # laws differentiate their networks inside
-            state_bar, parameter_bars = ctx.recording.backward(positions_bar)
-        bars = [bar.to(dtype) for bar, dtype in zip(state_bar.tensors(), ctx.dtypes, strict=True)]
-        return None, None, None, None, *bars, *parameter_bars
+            adjoint = ctx.recording.backward(positions_bar)
+        bars = [bar.to(dtype) for bar, dtype in zip(adjoint.state.tensors(), ctx.dtypes, strict=True)]
+        return None, None, None, None, None, *bars, *adjoint.law, *_through(ctx.recording, ctx.effects, adjoint)
 
 
-def rollout(simulator: Simulator, law: Law, initial: State, steps: int, outputs: list[int]) -> torch.Tensor:
+def _leaves(effects: ActiveEffects) -> ActiveEffects:
+    members = tuple((effect, theta.detach().clone().requires_grad_()) for effect, theta in effects.members)
+    return ActiveEffects(members, effects.setting)
+
+
+def _through(recording, effects: ActiveEffects | None, adjoint) -> list[torch.Tensor | None]:
+    """Adjoints of the effects' parameters, from those of coefficients and masses."""
+    if effects is None:
+        return []
+    outputs = [*recording.coefficients, recording.mass]
+    bars = [*adjoint.coefficients, adjoint.mass]
+    used = [(o, b.to(o.dtype)) for o, b in zip(outputs, bars, strict=True) if o.requires_grad]
+    if not used:
+        return [None] * len(effects.members)
+    return list(
+        torch.autograd.grad(
+            [o for o, _ in used], [t for _, t in effects.members], [b for _, b in used], allow_unused=True
+        )
+    )
+
+
+def rollout(
+    simulator: Simulator,
+    law: Law,
+    initial: State,
+    steps: int,
+    outputs: list[int],
+    effects: ActiveEffects | None = None,
+) -> torch.Tensor:
     """Positions (K, N, 3) [m, simulation frame] at the substeps ``outputs`` of ``steps`` substeps from ``initial``.
 
-    Differentiable with respect to the initial state and the parameters of the law. Bit-reproducible for a number of
-    chunks. Raises NonFiniteError.
+    Differentiable with respect to the initial state and the parameters of the law and of the effects. Bit-reproducible
+    for a number of chunks. ``effects`` may also move the ground or the clock: that is the caller's to apply. Raises
+    NonFiniteError.
     """
-    return _Rollout.apply(simulator, law, steps, outputs, *initial.tensors(), *law.parameters())
+    thetas = [theta for _, theta in effects.members] if effects is not None else []
+    return _Rollout.apply(simulator, law, steps, outputs, effects, *initial.tensors(), *law.parameters(), *thetas)
 
 
 def at_rest(position: torch.Tensor, velocity: torch.Tensor, affine_velocity: torch.Tensor) -> State:

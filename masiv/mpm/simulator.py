@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from masiv import runtime
+from masiv.effects.active import ActiveEffects, BoundEffects
 from masiv.errors import MasivError, NonFiniteError
 from masiv.materials.law import Law
 
@@ -90,24 +91,33 @@ class Simulator:
         steps = min(_round_up(max_substeps, 64), 1 << int(math.log2(affordable)))
         self.k = _kernels(real, steps, particles, grid_nodes, chunks)
 
-    def run(self, initial: State, law: Law, steps: int, outputs: list[int]) -> Recording:
-        """Simulate ``steps`` substeps. outputs: the substeps (ascending, 0 is the start) whose positions are wanted.
+    def run(
+        self,
+        initial: State,
+        law: Law,
+        steps: int,
+        outputs: list[int],
+        effects: ActiveEffects | None = None,
+        time: float = 0.0,
+    ) -> Recording:
+        """Simulate ``steps`` substeps. outputs: the substeps (ascending, 0 is the start) whose positions are wanted;
+        time [s]: that of the start, for effects that depend on it.
 
         Raises NonFiniteError when a particle becomes non-finite or crosses more than a cell in a substep.
         """
-        recording = Recording(self, law, steps, outputs)
+        recording = Recording(self, law, steps, outputs, effects, time)
         recording.forward(initial)
         return recording
 
     # ---- one substep ---------------------------------------------------------------------------------------------
 
-    def apply_constants(self) -> None:
-        """Write this simulator's constants to the fields, which simulators of the same capacity share."""
+    def apply_constants(self, mass: torch.Tensor) -> None:
+        """Write constants and masses (N,) [kg] to the fields, which simulators of the same capacity share."""
         c = self.constants
         values = [c["substep"], c["spacing"], c["volume"], *c["gravity"], c["friction"]]
         for index, value in enumerate(values):
             self.k.constants[index] = value
-        self.k.write_mass(self.mass)
+        self.k.write_mass(mass)
         self.k.contact[None] = c["contact"]
 
     def window(self, s: int, reckless: bool) -> tuple[int, ...]:
@@ -136,15 +146,43 @@ class Simulator:
         return math.prod(window[3:])
 
 
+@dataclass(frozen=True)
+class Adjoint:
+    """Adjoints of a rollout's inputs: initial state, the law's parameters, coefficients of the effects, masses (N,)."""
+
+    state: State
+    law: tuple[torch.Tensor | None, ...]
+    coefficients: list[torch.Tensor]
+    mass: torch.Tensor
+
+
 class Recording:
     """What a rollout keeps: the positions asked for, and what its adjoint needs."""
 
-    def __init__(self, simulator: Simulator, law: Law, steps: int, outputs: list[int]) -> None:
+    def __init__(
+        self,
+        simulator: Simulator,
+        law: Law,
+        steps: int,
+        outputs: list[int],
+        effects: ActiveEffects | None,
+        time: float,
+    ) -> None:
         self.simulator = simulator
         self.steps = steps
         self.outputs = {step: row for row, step in enumerate(outputs)}
         self.law = law
         self.bound = law.bind(simulator.k, simulator.count, simulator.substep)
+        self.time = time
+        members = effects.kernel_members if effects else []
+        self.coefficients = effects.coefficients() if effects else []
+        self.effects = BoundEffects(
+            [(effect, c) for (effect, _), c in zip(members, self.coefficients, strict=True)],
+            simulator.k,
+            simulator.count,
+        )
+        factor = effects.mass_factor() if effects else None
+        self.mass = simulator.mass if factor is None else simulator.mass * factor.to(simulator.dtype)
         self.segment = min(simulator.k.capacity_steps, steps)
         self.starts: list[State] = []
         self.windows: dict[int, tuple[int, ...]] = {}
@@ -153,7 +191,8 @@ class Recording:
 
     def forward(self, initial: State) -> None:
         sim = self.simulator
-        sim.apply_constants()
+        sim.apply_constants(self.mass.detach())
+        self.effects.write()
         state = State(*(t.detach().to(sim.dtype).contiguous() for t in initial.tensors()))
         for start in range(0, self.steps, self.segment):
             self.starts.append(state)
@@ -182,8 +221,10 @@ class Recording:
             nodes = sim.set_window(window)
             k.clear_fault()
             for s in range(begin, end):
-                self.bound.p2g(k, s, sim.count, nodes)
-                k.grid_update(self._log(s, nodes))
+                offset = self._log(s, nodes)
+                self.effects.p2g(self.bound, s, nodes)
+                k.grid_update(offset)
+                self.effects.grid_velocities(offset, nodes, self._instant(start + s))
                 k.g2p(s, sim.count)
             self.logs[end] = self.logs[begin] + (end - begin) * nodes
             too_fast, outside = k.read_fault()
@@ -194,6 +235,9 @@ class Recording:
             if outside < 0:
                 return
         raise NonFiniteError(start + (outside >> 32), outside & 0xFFFFFFFF, "non-finite position")
+
+    def _instant(self, step: int) -> float:
+        return self.time + step * self.simulator.substep
 
     def _log(self, s: int, nodes: int) -> int:
         """Where the grid of local substep s is kept for the adjoint, or 0 (scratch) where the log is full."""
@@ -215,10 +259,11 @@ class Recording:
         sim.k.read_state(s, *out)
         return State(*out)
 
-    def backward(self, positions_bar: torch.Tensor) -> tuple[State, tuple[torch.Tensor | None, ...]]:
-        """Adjoint of the output positions (K, N, 3) -> adjoints of the initial state and of the law's parameters."""
+    def backward(self, positions_bar: torch.Tensor) -> Adjoint:
+        """From the adjoint (K, N, 3) of the output positions."""
         sim, k = self.simulator, self.simulator.k
-        sim.apply_constants()
+        sim.apply_constants(self.mass.detach())
+        self.effects.write()
         k.clear_bars(sim.count)
         bars = positions_bar.detach().to(sim.dtype).contiguous()
         for index in reversed(range(len(self.starts))):
@@ -243,13 +288,21 @@ class Recording:
                 else:
                     k.p2g(s, sim.count, nodes)
                     k.grid_update(offset)
+                instant = self._instant(start + s)
+                self.effects.grid_velocities(offset, nodes, instant)
                 k.g2p_adjoint(s, sim.count, nodes)
-                k.grid_adjoint(offset)
+                if self.effects.on_grid:
+                    self.effects.grid_adjoint(offset, nodes, instant)
+                else:
+                    k.grid_adjoint(offset)
                 k.p2g_adjoint(s, sim.count)
+                self.effects.stress_adjoint(self.bound, s)
                 self.bound.backward(s, sim.count)
         if 0 in self.outputs:
             k.add_position_bar(bars[self.outputs[0]])
         shapes = ((3,), (3,), (3, 3), (3, 3))
         out = tuple(torch.empty(sim.count, *shape, dtype=sim.dtype) for shape in shapes)
         k.read_bars(*out)
-        return State(*out), self.bound.parameter_gradients()
+        mass = torch.empty(sim.count, dtype=sim.dtype)
+        k.read_mass_bar(mass)
+        return Adjoint(State(*out), self.bound.parameter_gradients(), self.effects.gradients(), mass)

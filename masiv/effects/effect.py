@@ -1,0 +1,79 @@
+"""The interface of every effect: physics that the model may lack, zero in the model as it is."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """A number of an effect. ``step`` is a change that a video of an object of half a metre can just show; ``lower``
+    and ``upper`` are what is physically possible; ``start`` where a search begins (a strength begins at 0)."""
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    step: float
+    start: float = 0.0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What an effect may know of the scene, simulation frame (y up, ground at y = 0), SI units: gravity (3,), positions
+    ``rest`` (N, 3) and mass of the particles at frame 0, size of the body, and how long it is watched [s]."""
+
+    gravity: torch.Tensor
+    rest: torch.Tensor
+    particle_mass: float
+    size: float
+    duration: float
+
+
+class Effect(ABC):
+    """One effect; a subclass a file in ``masiv/effects``, found there by ``masiv.effects.library``.
+
+    A subclass sets ``name``, ``looks_like`` (what it does in a video, one line), ``parameters`` (the first ones, as
+    many as ``strengths``, are the strength: where they are zero the effect is absent) and overrides one or more hooks.
+    """
+
+    name: ClassVar[str]
+    looks_like: ClassVar[str]
+    parameters: ClassVar[tuple[EffectParameter, ...]]
+    strengths: ClassVar[int] = 1
+    on_grid: ClassVar[str | None] = None
+    """``nodes``: ``node_velocity`` acts everywhere, before contact; ``ground``: it is the contact with the ground."""
+    on_stress: ClassVar[bool] = False
+
+    def node_velocity(self) -> Callable[..., Any]:
+        """Taichi function (x, v, held, t, dt, c) -> v, see ``masiv.kernels.effects.NodeKernels``."""
+        raise NotImplementedError
+
+    def particle_stress(self) -> Callable[..., Any]:
+        """Taichi function (tau, F, C, c) -> tau, see ``masiv.kernels.effects.StressKernels``."""
+        raise NotImplementedError
+
+    def coefficients(self, theta: torch.Tensor, setting: Setting) -> torch.Tensor:
+        """Parameters (P,) -> c, shape (K,) for an effect on the grid, (N, K) for one on the stress; differentiable."""
+        return theta.expand(len(setting.rest), -1) if self.on_stress else theta
+
+    def mass_factor(self, theta: torch.Tensor, setting: Setting) -> torch.Tensor | None:
+        """Factor (N,) of the particles' masses, or None where the effect leaves masses alone."""
+        return None
+
+    def ground_shift(self, theta: torch.Tensor) -> torch.Tensor | None:
+        """How far () [m] the effect raises the ground, or None."""
+        return None
+
+    def time_shift(self, theta: torch.Tensor) -> torch.Tensor | None:
+        """How much later () [s] than its time stamp a frame was taken, or None."""
+        return None
+
+    def guesses(self, setting: Setting) -> list[tuple[float, ...]]:
+        """Values of the parameters after the strengths to try in the score test, each a tuple."""
+        return [tuple(p.start for p in self.parameters[self.strengths :])]

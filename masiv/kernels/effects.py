@@ -1,0 +1,241 @@
+"""Kernels that apply an effect to the grid or to the stress, and their adjoints by Taichi's autodiff.
+
+An effect's function is pointwise: a node's or a particle's. Its coefficients are copied to every node or particle, so
+that no two of them add to the same gradient.
+"""
+
+import taichi as ti
+
+from masiv.kernels.mpm import DT, DX, NO_GROUND, momentum_of
+
+
+@ti.data_oriented
+class OpenGrid:
+    """The grid update of ``MpmKernels`` taken apart, so that effects can act between gravity and contact."""
+
+    def __init__(self, mpm):
+        self.mpm = mpm
+        self.before = ti.Vector.field(3, mpm.real, shape=mpm.capacity_nodes)
+
+    @ti.kernel
+    def free(self, offset: ti.i32, nodes: ti.i32):
+        """Velocity of the nodes after gravity, from the log at ``offset``."""
+        for n in range(nodes):
+            value = self.mpm.grid_momentum[offset + n]
+            v = ti.Vector.zero(self.mpm.real, 3)
+            if value[3] > 0.0:
+                v = momentum_of(value) / value[3] + self.mpm.constants[DT] * self.mpm.gravity()
+            self.mpm.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
+
+    @ti.func
+    def grounded(self, n: ti.i32):
+        row = n // self.mpm.window_shape[None][2]
+        return self.mpm.contact[None] != NO_GROUND and self.mpm.node_height(row) <= 0
+
+    @ti.kernel
+    def contact(self, nodes: ti.i32):
+        for n in range(nodes):
+            v = momentum_of(self.mpm.grid_velocity[n])
+            self.before[n] = v
+            if self.grounded(n):
+                v = self.mpm.contact_velocity(v)
+            self.mpm.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
+
+    @ti.kernel
+    def sum_bars(self, nodes: ti.i32):
+        """What ``g2p_adjoint`` scattered -> ``grid_velocity_bar``."""
+        for n in range(nodes):
+            self.mpm.grid_velocity_bar[n] = momentum_of(self.mpm.sum_of_chunks(n))
+
+    @ti.kernel
+    def contact_adjoint(self, nodes: ti.i32):
+        for n in range(nodes):
+            if self.grounded(n):
+                self.mpm.grid_velocity_bar[n] = self.mpm.contact_adjoint(self.before[n], self.mpm.grid_velocity_bar[n])
+
+    @ti.kernel
+    def momentum_adjoint(self, offset: ti.i32, nodes: ti.i32):
+        """``grid_velocity_bar`` after gravity -> ``grid_momentum_bar``."""
+        for n in range(nodes):
+            out = ti.Vector.zero(self.mpm.real, 4)
+            value = self.mpm.grid_momentum[offset + n]
+            if value[3] > 0.0:
+                bar = self.mpm.grid_velocity_bar[n]
+                out = ti.Vector([bar[0], bar[1], bar[2], -bar.dot(momentum_of(value)) / value[3]]) / value[3]
+            self.mpm.grid_momentum_bar[n] = out
+
+
+@ti.data_oriented
+class NodeKernels:
+    """``function(x, v, held, t, dt, c) -> v`` on the nodes of the grid: position [m], velocity [m/s] after gravity and
+    earlier effects, the velocity that the ground's contact would give, time [s], substep [s], coefficients.
+
+    grounded: the function is the ground's contact and is applied to nodes on or below it alone.
+    """
+
+    def __init__(self, mpm, function, coefficients: int, grounded: bool):
+        self.mpm = mpm
+        self.function = function
+        self.grounded = grounded
+        self.n = coefficients
+        self.c = ti.field(mpm.real, shape=coefficients)
+        capacity, real = mpm.capacity_nodes, mpm.real
+        self.before = ti.Vector.field(3, real, shape=capacity, needs_grad=True)
+        self.after = ti.Vector.field(3, real, shape=capacity, needs_grad=True)
+        self.coefficients = ti.Vector.field(coefficients, real, shape=capacity, needs_grad=True)
+        self.total = ti.field(real, shape=coefficients)
+
+    @ti.kernel
+    def write(self, values: ti.types.ndarray()):
+        """values (K,); the sums of their gradients start at zero."""
+        for i in range(values.shape[0]):
+            self.c[i] = values[i]
+            self.total[i] = 0.0
+
+    @ti.kernel
+    def read_gradient(self, out: ti.types.ndarray()):
+        for i in range(out.shape[0]):
+            out[i] = self.total[i]
+
+    @ti.func
+    def node_position(self, n: ti.i32):
+        shape, origin = self.mpm.window_shape[None], self.mpm.window_origin[None]
+        k = n % shape[2]
+        j = (n // shape[2]) % shape[1]
+        i = n // (shape[2] * shape[1])
+        dx = self.mpm.constants[DX]
+        return ti.Vector([(origin[0] + i) * dx, (origin[1] + j) * dx, (origin[2] + k) * dx])
+
+    @ti.func
+    def concerns(self, x):
+        out = True
+        if ti.static(self.grounded):
+            out = self.mpm.contact[None] != NO_GROUND and x[1] < 0.5 * self.mpm.constants[DX]
+        return out
+
+    @ti.kernel
+    def apply(self, nodes: ti.i32, t: ti.f64):
+        """``grid_velocity`` -> the same after the effect."""
+        for n in range(nodes):
+            v = momentum_of(self.mpm.grid_velocity[n])
+            self.before[n] = v
+            x = self.node_position(n)
+            out = v
+            if self.concerns(x):
+                c = ti.Vector.zero(self.mpm.real, self.n)
+                for i in ti.static(range(self.n)):
+                    c[i] = self.c[i]
+                held = self.mpm.contact_velocity(v)
+                out = self.function(x, v, held, ti.cast(t, self.mpm.real), self.mpm.constants[DT], c)
+            self.mpm.grid_velocity[n] = ti.Vector([out[0], out[1], out[2], 0.0])
+
+    @ti.kernel
+    def load(self, nodes: ti.i32):
+        for n in range(nodes):
+            self.after.grad[n] = self.mpm.grid_velocity_bar[n]
+            self.before.grad[n] = ti.Vector.zero(self.mpm.real, 3)
+            for i in ti.static(range(self.n)):
+                self.coefficients[n][i] = self.c[i]
+                self.coefficients.grad[n][i] = 0.0
+
+    @ti.kernel
+    def pointwise(self, nodes: ti.i32, t: ti.f64):
+        for n in range(nodes):
+            x = self.node_position(n)
+            v = self.before[n]
+            if self.concerns(x):
+                held = self.mpm.contact_velocity(v)
+                self.after[n] = self.function(
+                    x, v, held, ti.cast(t, self.mpm.real), self.mpm.constants[DT], self.coefficients[n]
+                )
+            else:
+                self.after[n] = v
+
+    @ti.kernel
+    def store(self, nodes: ti.i32):
+        for n in range(nodes):
+            self.mpm.grid_velocity_bar[n] = self.before.grad[n]
+        ti.loop_config(serialize=True)  # in order: the sum is the same to the bit
+        for n in range(nodes):
+            for i in ti.static(range(self.n)):
+                self.total[i] += self.coefficients.grad[n][i]
+
+    def adjoint(self, nodes: int, t: float) -> None:
+        """``grid_velocity_bar`` after the effect -> before it, from ``before`` as ``apply`` left it."""
+        self.load(nodes)
+        self.pointwise.grad(nodes, t)
+        self.store(nodes)
+
+
+@ti.data_oriented
+class StressKernels:
+    """``function(tau, F, C, c) -> tau`` on particles: Kirchhoff stress [Pa], elastic deformation gradient, affine
+    velocity (the velocity gradient) [1/s], coefficients of the particle."""
+
+    def __init__(self, mpm, function, coefficients: int):
+        self.mpm = mpm
+        self.function = function
+        self.n = coefficients
+        capacity, real = mpm.capacity_particles, mpm.real
+        self.c = ti.Vector.field(coefficients, real, shape=capacity)
+        self.total = ti.Vector.field(coefficients, real, shape=capacity)
+        self.before = ti.Matrix.field(3, 3, real, shape=capacity, needs_grad=True)
+        self.after = ti.Matrix.field(3, 3, real, shape=capacity, needs_grad=True)
+        self.gradient = ti.Matrix.field(3, 3, real, shape=capacity, needs_grad=True)
+        self.affine = ti.Matrix.field(3, 3, real, shape=capacity, needs_grad=True)
+        self.coefficients = ti.Vector.field(coefficients, real, shape=capacity, needs_grad=True)
+
+    @ti.kernel
+    def write(self, values: ti.types.ndarray()):
+        """values (N, K); the sums of their gradients start at zero."""
+        for p in range(values.shape[0]):
+            for i in ti.static(range(self.n)):
+                self.c[p][i] = values[p, i]
+                self.total[p][i] = 0.0
+
+    @ti.kernel
+    def read_gradient(self, out: ti.types.ndarray()):
+        for p in range(out.shape[0]):
+            for i in ti.static(range(self.n)):
+                out[p, i] = self.total[p][i]
+
+    @ti.kernel
+    def apply(self, s: ti.i32, count: ti.i32):
+        for p in range(count):
+            tau = self.mpm.kirchhoff_stress[s, p]
+            self.before[p] = tau
+            self.mpm.kirchhoff_stress[s, p] = self.function(
+                tau, self.mpm.deformation_gradient[s, p], self.mpm.affine_velocity[s, p], self.c[p]
+            )
+
+    @ti.kernel
+    def load(self, s: ti.i32, count: ti.i32):
+        zero = ti.Matrix.zero(self.mpm.real, 3, 3)
+        for p in range(count):
+            self.gradient[p] = self.mpm.deformation_gradient[s, p]
+            self.affine[p] = self.mpm.affine_velocity[s, p]
+            self.coefficients[p] = self.c[p]
+            self.after.grad[p] = self.mpm.stress_bar[p]
+            self.before.grad[p] = zero
+            self.gradient.grad[p] = zero
+            self.affine.grad[p] = zero
+            self.coefficients.grad[p] = ti.Vector.zero(self.mpm.real, self.n)
+
+    @ti.kernel
+    def pointwise(self, count: ti.i32):
+        for p in range(count):
+            self.after[p] = self.function(self.before[p], self.gradient[p], self.affine[p], self.coefficients[p])
+
+    @ti.kernel
+    def store(self, count: ti.i32):
+        for p in range(count):
+            self.mpm.stress_bar[p] = self.before.grad[p]
+            self.mpm.gradient_bar[p] += self.gradient.grad[p]
+            self.mpm.affine_bar[p] += self.affine.grad[p]
+            self.total[p] += self.coefficients.grad[p]
+
+    def adjoint(self, s: int, count: int) -> None:
+        """``stress_bar`` after the effect -> before it, from ``before`` as ``apply`` left it."""
+        self.load(s, count)
+        self.pointwise.grad(count)
+        self.store(count)
