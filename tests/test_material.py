@@ -13,10 +13,9 @@ import torch
 from masiv.errors import InputError, NonFiniteError
 from masiv.materials import curves
 from masiv.materials.classical import ClassicalLaw
-from masiv.materials.describe import Quantity, describe, describe_twin, determined, paragraph, said
+from masiv.materials.describe import Quantity, describe, describe_twin, paragraph, said
 from masiv.materials.excitation import Excited, excited_range, perturbed, sensitivities
 from masiv.materials.load import load_law
-from masiv.materials.neural import NeuralLaw
 from masiv.materials.pretrain import MATERIALS, pretrained_path
 from masiv.mpm.rollout import at_rest
 from masiv.report.material import material_section, read_material
@@ -250,9 +249,3 @@ def test_quantities_are_said_with_fitting_units():
     assert said(Quantity(2e6, "Pa", "under pressure")) == "2 MPa (under pressure)"
     assert said(Quantity(None, "Pa")) == "none"
     assert said(Quantity(0.3, "", stderr_percent=250.0)) == "0.3 ± more than 100 %"
-
-
-def test_a_motion_without_a_law_to_perturb_leaves_the_material_as_it_is():
-    law = NeuralLaw(seed=1)
-    material = describe(law, SEEN)
-    assert determined(material, [], 3.0).quantities == material.quantities

@@ -131,6 +131,8 @@ def test_a_blend_keeps_what_a_law_guarantees():
     torch.testing.assert_close(law.stress(turn @ f), turn @ law.stress(f) @ turn.mT, rtol=1e-8, atol=1e-4)
     torch.testing.assert_close(law.stress(f @ turn), law.stress(f), rtol=1e-8, atol=1e-4)
     torch.testing.assert_close(law.project(turn @ f, dt), turn @ law.project(f, dt), rtol=1e-8, atol=1e-9)
+    stiffness = [end.wave_modulus() for end in (law.first, law.second, law)]
+    assert stiffness[2] == pytest.approx(0.6 * stiffness[0] + 0.4 * stiffness[1])
     share = law.flow_share(strain_invariants(f), dt)
     ends = [end.flow_share(strain_invariants(f), dt) for end in (law.first, law.second)]
     assert (share >= torch.minimum(*ends) - 1e-12).all()

@@ -71,7 +71,7 @@ class BlendedLaw(Law):
         blended, *own = self.log_rates(invariants)
         parts = []
         for law, log_rate in zip((self.first, self.second), own, strict=True):
-            shape, volume = torch.exp((blended - log_rate).clamp_max(0)).unbind(1)
+            shape, volume = torch.exp((_felt(blended) - _felt(log_rate)).clamp_max(0)).unbind(1)
             carried = invariants * torch.stack([volume, shape**2, shape**2], dim=1)
             parts.append(law.moduli(carried) * torch.stack([shape, shape, volume, shape**2], dim=1))
         return (1 - self.weight) * parts[0] + self.weight * parts[1]
@@ -107,6 +107,11 @@ class BlendedLaw(Law):
                 "bulk_modulus_at_rest": {"value": kappa, "unit": "Pa"},
             },
         }
+
+
+def _felt(log_rate: torch.Tensor) -> torch.Tensor:
+    """A flow that takes longer than a second is none: how slow it is must not weigh."""
+    return log_rate.clamp_min(0)
 
 
 def _between(first: ClassicalLaw, second: ClassicalLaw, weight: float) -> dict[str, float]:

@@ -242,7 +242,7 @@ def _friction(law: Law, log_volume: float, strain: float, dt: float) -> Quantity
     amounts = math.sqrt(3) * strain * np.arange(1, POINTS + 1) / POINTS
     stress = curves.drive(law, curves.simple_shear(amounts, log_volume)[:, None], dt)[1][-1, 0]
     pressure = -float(stress.trace()) / 3
-    deviator = float((stress + pressure * np.eye(3)).norm())
+    deviator = float(np.linalg.norm(stress.numpy() + pressure * np.eye(3)))
     if pressure <= 0:
         return Quantity(None, "deg", "no pressure builds up")
     alpha = deviator / (3 * pressure)

@@ -100,7 +100,7 @@ def perturbed(law: Law, factor: float = STEP) -> dict[str, Law]:
         }
     if not isinstance(law, ClassicalLaw):
         return {}
-    values = {name: float(value) for name, value in law.values.items()}
+    values = {name: float(value.detach()) for name, value in law.values.items()}
     changed: dict[str, dict[str, float]] = {}
     if {"youngs_modulus", "poissons_ratio"} <= values.keys():
         shear, bulk = _shear_and_bulk(values)
