@@ -8,6 +8,8 @@ import numpy as np
 import torch
 
 from masiv.continuum.trajectory import Trajectory
+from masiv.effects.active import ActiveEffects
+from masiv.effects.effect import Setting
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.law import Law
 from masiv.mpm.config import SimulatorConfig
@@ -89,7 +91,25 @@ class Problem:
             config=self.simulator,
         )
 
-    def run(self, law: Law, motion: Motion, contact: str, frames: int, steps: int | None = None) -> torch.Tensor:
+    def setting(self) -> Setting:
+        """What effects may know of the scene."""
+        return Setting(
+            gravity=torch.as_tensor(self.gravity, dtype=torch.float32),
+            rest=self.start,
+            particle_mass=self.scene.density * self.volume / self.count,
+            size=self.size,
+            duration=self.frames / self.scene.fps,
+        )
+
+    def run(
+        self,
+        law: Law,
+        motion: Motion,
+        contact: str,
+        frames: int,
+        steps: int | None = None,
+        effects: ActiveEffects | None = None,
+    ) -> torch.Tensor:
         """Positions (frames * samples, N, 3) [m, simulation frame of the scene], differentiable. steps: substeps a
         frame, a multiple of ``samples``; as many as the law needs where None. Raises NonFiniteError."""
         steps = steps or self.substeps(law)
@@ -107,11 +127,21 @@ class Problem:
             chunks=self.simulator.chunks,
         )
         # The ground is the plane y = 0 of the simulation: raising it is lowering the body.
-        shift = torch.stack([torch.zeros(()), motion.ground_offset, torch.zeros(())])
+        raised = motion.ground_offset + (effects.ground_shift() if effects else 0.0)
+        shift = torch.stack([torch.zeros(()), raised, torch.zeros(())])
         state = thrown(self.start - shift, motion.velocity, motion.omega)
         every = steps // self.samples
-        outputs = list(range(every, frames * steps + 1, every))
-        return rollout(simulator, law, state, frames * steps, outputs) + shift
+        instants = torch.arange(every, frames * steps + 1, every)
+        late = effects.time_shift() * self.scene.fps * steps if effects else torch.zeros(())
+        if float(late) == 0.0 and not late.requires_grad:
+            return rollout(simulator, law, state, frames * steps, instants.tolist(), effects) + shift
+        # Between two substeps a particle moves in a straight line.
+        whole = int(torch.floor(late))
+        before = (instants + whole).clamp_min(0)
+        wanted = torch.unique(torch.cat([before, before + 1]))
+        positions = rollout(simulator, law, state, int(wanted[-1]), wanted.tolist(), effects)
+        early, after = (positions[torch.searchsorted(wanted, k)] for k in (before, before + 1))
+        return early + (late - whole) * (after - early) + shift
 
     def error(self, positions: torch.Tensor) -> torch.Tensor:
         """Mean distance [m] to the observed trajectories, positions (K, N, 3) from the start."""
