@@ -11,8 +11,10 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.identify.classical_fit import FamilyFit, fit_all_particles, fit_family, information_criteria, ranked
 from masiv.identify.families import FAMILIES
-from masiv.identify.found import Found
+from masiv.identify.fit import fit as fit_weights
+from masiv.identify.found import Found, history_rows
 from masiv.identify.problem import Motion, Problem
+from masiv.materials.adapter import AdapterLaw
 from masiv.progress import Progress
 
 SHORT = 1 / 3
@@ -20,10 +22,17 @@ FINALISTS = 2
 
 
 def identify_classical(
-    problem: Problem, few: Problem, motion: Motion, first_frames: int, checkpoint: Checkpoint, progress: Progress
+    problem: Problem,
+    few: Problem,
+    motion: Motion,
+    first_frames: int,
+    seed: int,
+    checkpoint: Checkpoint,
+    progress: Progress,
 ) -> Found:
-    """``problem.config.law`` is a family or auto. Raises MasivError where no family explains the motion."""
-    law = problem.config.law
+    """``problem.config.law`` is a family, auto or adapter. Raises MasivError where no family explains the motion."""
+    config = problem.config
+    law = config.adapter_base if config.law == "adapter" else config.law
     fit = functools.partial(
         fit_family, few=few, motion=motion, first_frames=first_frames, checkpoint=checkpoint, progress=progress
     )
@@ -41,11 +50,31 @@ def identify_classical(
         "omega_stderr_rad_per_s": [errors[f"omega_{a}"] for a in "xyz"],
         "ground_stderr_m": errors.get("ground_offset"),
         "independent_samples": chosen.samples,
-        "rollouts": sum(f.rollouts for f in fits),
+        "rollouts": chosen.rollouts + sum(f.rollouts for f in fits if f.kind != chosen.kind),
     }
     if law == "auto":
         report["families"] = family_rows(fits) + [{"law": kind, "failed": why} for kind, why in failures.items()]
-    return Found(chosen.law, chosen.motion, chosen.contact, chosen.error_m, report)
+    if config.law != "adapter":
+        return Found(chosen.law, chosen.motion, chosen.contact, chosen.error_m, report)
+    start = AdapterLaw(chosen.law, rank=config.adapter_rank, seed=seed).float()
+    start.base.double()
+    fitted = fit_weights(
+        problem, start, chosen.motion, chosen.contact, first_frames,
+        seed=seed, checkpoint=Beside(checkpoint), progress=progress,
+    )  # fmt: skip
+    report["classical_error_mm"] = 1e3 * chosen.error_m
+    return Found(fitted.law, fitted.motion, chosen.contact, fitted.error_m, report, history_rows(fitted))
+
+
+class Beside(Checkpoint):
+    """A checkpoint whose states are saved beside what it held when it was made."""
+
+    def __init__(self, checkpoint: Checkpoint) -> None:
+        super().__init__(checkpoint.path, checkpoint.every_s)
+        self.fixed = self.load() or {}
+
+    def save(self, state: dict[str, Any]) -> None:
+        super().save({**self.fixed, **state})
 
 
 def _shortlisted(fit: Callable[..., FamilyFit]) -> tuple[list[FamilyFit], dict[str, str]]:

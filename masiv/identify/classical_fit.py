@@ -26,6 +26,7 @@ RECONSIDERED = 3
 LEAST_GAIN = 1e-3
 """A fit goes on while a step lowers the cost by this share."""
 CHORD_STEPS = 4
+ALL = "all particles"
 
 
 @dataclass
@@ -129,8 +130,8 @@ def fit_family(
     return found
 
 
-def _keep(checkpoint: Checkpoint, found: FamilyFit) -> None:
-    checkpoint.save({**(checkpoint.load() or {}), found.kind: found.state()})
+def _keep(checkpoint: Checkpoint, found: FamilyFit, name: str | None = None) -> None:
+    checkpoint.save({**(checkpoint.load() or {}), name or found.kind: found.state()})
 
 
 def _stage(
@@ -168,10 +169,12 @@ def fit_all_particles(
     """Chord steps: the Jacobian of few particles on the residual of the same particles in rollouts of all of them.
 
     A finer body is a little stiffer and loses less to the grid, which moves the residual more than its derivative.
+    Saved to ``checkpoint`` apart from the fit on few particles, which families are compared by.
     """
-    if found.stage >= 4:
-        return found
-    label = f"identify: {found.kind} fit, all particles"
+    saved = (checkpoint.load() or {}).get(f"{found.kind}, {ALL}")
+    if saved is not None:
+        return FamilyFit(**saved)
+    label = f"identify: {found.kind} fit, {ALL}"
     total = CHORD_STEPS + 2
     family = FAMILIES[found.kind].scaled(few.scene.density)
     parameters = _parameters(few, family, found)
@@ -208,7 +211,7 @@ def fit_all_particles(
     estimate = Estimate(values, spread, jacobian, residual, coarse.evaluations + CHORD_STEPS + 1, tuple(parameters))
     found = _updated(few, found, estimate, residual.reshape(-1, few.count, 3), 4)
     found.error_m = mean_distance(best)
-    _keep(checkpoint, found)
+    _keep(checkpoint, found, f"{found.kind}, {ALL}")
     progress(label, total, total, f"{1e3 * found.error_m:.1f} mm")
     return found
 

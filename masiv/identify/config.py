@@ -20,6 +20,10 @@ class IdentifyConfig(BaseModel):
         description="what is fitted: a neural law, a small correction of a classical law, a classical law's "
         "parameters, or (auto) the classical law that explains the motion best",
     )
+    adapter_base: Literal["auto", "neo_hookean", "newtonian", "non_newtonian", "von_mises", "drucker_prager"] = Field(
+        "auto", description="the classical law that an adapter corrects; auto: the one that explains the motion best"
+    )
+    adapter_rank: int = Field(2, ge=1, le=4, description="shapes of strain dependence that an adapter may learn")
     family_rollouts: int = Field(45, ge=2, description="rollouts of each of the two stages of a classical law's fit")
     start: Literal["auto", "jelly", "plasticine", "sand", "water"] = Field(
         "auto", description="pretrained law to start from; auto takes the one that explains the motion best"

@@ -14,6 +14,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.problem import Motion, Problem
 from masiv.identify.silhouette import silhouette_error
+from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
 
@@ -25,7 +26,7 @@ class Fit:
     """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; history: (iteration,
     frames, trajectory error [m], silhouette error)."""
 
-    law: NeuralLaw
+    law: NeuralLaw | AdapterLaw
     motion: Motion
     error_m: float = math.inf
     history: list[tuple[int, int, float, float]] = field(default_factory=list)
@@ -33,7 +34,7 @@ class Fit:
 
 def fit(
     problem: Problem,
-    law: NeuralLaw,
+    law: NeuralLaw | AdapterLaw,
     motion: Motion,
     contact: str,
     first_frames: int,
@@ -50,15 +51,20 @@ def fit(
     config = problem.config
     law = copy.deepcopy(law)
     motion = Motion(*(t.detach().clone().requires_grad_() for t in motion.tensors()))
-    scales = [law.log_stress_scale, law.log_flow_strain]
-    weights = [*law.elastic.parameters(), *law.plastic.parameters()]
+    if isinstance(law, NeuralLaw):
+        scales = [law.log_stress_scale, law.log_flow_strain]
+        weights = [*law.elastic.parameters(), *law.plastic.parameters()]
+    else:
+        scales, weights = [], [p for p in law.parameters() if p.requires_grad]
     groups = [
         (weights, config.law_learning_rate),
         (scales, config.scale_learning_rate),
         ([motion.velocity, motion.omega], config.velocity_learning_rate),
         ([motion.ground_offset], config.ground_learning_rate),
     ]
-    optimiser = torch.optim.Adam([{"params": p, "lr": rate, "rate": rate} for p, rate in groups], betas=(0.9, 0.95))
+    optimiser = torch.optim.Adam(
+        [{"params": p, "lr": rate, "rate": rate} for p, rate in groups if p], betas=(0.9, 0.95)
+    )
     parameters = [*weights, *scales, *motion.tensors()]
     best = Fit(copy.deepcopy(law), Motion(*(t.detach().clone() for t in motion.tensors())))
     first, caution, failures = 0, 1.0, 0

@@ -68,7 +68,7 @@ def _identify(
     if config.law == "neural":
         found = _neural(problem, few, motion, first_frames, seed, checkpoint, progress)
     else:
-        found = identify_classical(problem, few(), motion, first_frames, checkpoint, progress)
+        found = identify_classical(problem, few(), motion, first_frames, seed, checkpoint, progress)
     ground = scene.ground
     if ground is not None:
         ground = Ground(ground.normal, ground.height + float(found.motion.ground_offset))

@@ -1,4 +1,4 @@
-"""Kernels that apply a classical law to the fields of a simulator, and their adjoints."""
+"""Kernels that apply a classical law, or one in strain invariants, to the fields of a simulator; and their adjoints."""
 
 import taichi as ti
 
@@ -82,3 +82,76 @@ class ClassicalKernels:
         self.load_adjoint(s, count)
         self.pointwise.grad(count)
         self.store_adjoint(count)
+
+
+@ti.data_oriented
+class InvariantKernels:
+    """A law whose coefficients are functions of the strain invariants, evaluated in torch between two kernels.
+
+    share (N, 2) are the coefficients of ``tensor.neural_flow``, moduli (N, 4) those of ``tensor.neural_stress``. The
+    adjoints are by hand: Taichi's autodiff takes minutes to compile the inverses.
+    """
+
+    def __init__(self, mpm):
+        self.mpm = mpm
+
+    @ti.kernel
+    def trial_invariants(self, s: ti.i32, out: ti.types.ndarray()):
+        for p in range(out.shape[0]):
+            value = tensor.invariants(self.mpm.trial_gradient[s, p])
+            for a in ti.static(range(3)):
+                out[p, a] = value[a]
+
+    @ti.kernel
+    def final_invariants(self, s: ti.i32, out: ti.types.ndarray()):
+        for p in range(out.shape[0]):
+            value = tensor.invariants(self.mpm.deformation_gradient[s, p])
+            for a in ti.static(range(3)):
+                out[p, a] = value[a]
+
+    @ti.kernel
+    def flow(self, s: ti.i32, share: ti.types.ndarray(), out: ti.types.ndarray()):
+        """Apply the flow, and give the invariants (N, 3) of what is left."""
+        for p in range(out.shape[0]):
+            f = tensor.neural_flow(self.mpm.trial_gradient[s, p], ti.Vector([share[p, 0], share[p, 1]]))
+            self.mpm.deformation_gradient[s, p] = f
+            value = tensor.invariants(f)
+            for a in ti.static(range(3)):
+                out[p, a] = value[a]
+
+    @ti.kernel
+    def elastic(self, s: ti.i32, moduli: ti.types.ndarray()):
+        for p in range(moduli.shape[0]):
+            c = ti.Vector([moduli[p, 0], moduli[p, 1], moduli[p, 2], moduli[p, 3]])
+            self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(self.mpm.deformation_gradient[s, p], c)
+
+    @ti.kernel
+    def elastic_adjoint(self, s: ti.i32, moduli: ti.types.ndarray(), moduli_bar: ti.types.ndarray()):
+        """``stress_bar`` -> added to ``gradient_bar``, and moduli_bar (N, 4)."""
+        for p in range(moduli.shape[0]):
+            c = ti.Vector([moduli[p, 0], moduli[p, 1], moduli[p, 2], moduli[p, 3]])
+            f_bar, c_bar = tensor.neural_stress_adjoint(self.mpm.deformation_gradient[s, p], c, self.mpm.stress_bar[p])
+            self.mpm.gradient_bar[p] += f_bar
+            for a in ti.static(range(4)):
+                moduli_bar[p, a] = c_bar[a]
+
+    @ti.kernel
+    def flow_adjoint(
+        self, s: ti.i32, share: ti.types.ndarray(), final_bar: ti.types.ndarray(), share_bar: ti.types.ndarray()
+    ):
+        """``gradient_bar`` and the adjoint (N, 3) of the final invariants -> ``trial_bar``, and share_bar (N, 2)."""
+        for p in range(share.shape[0]):
+            bar = ti.Vector([final_bar[p, 0], final_bar[p, 1], final_bar[p, 2]])
+            out_bar = self.mpm.gradient_bar[p] + tensor.invariants_adjoint(self.mpm.deformation_gradient[s, p], bar)
+            c = ti.Vector([share[p, 0], share[p, 1]])
+            f_bar, c_bar = tensor.neural_flow_adjoint(self.mpm.trial_gradient[s, p], c, out_bar)
+            self.mpm.trial_bar[p] = f_bar
+            for a in ti.static(range(2)):
+                share_bar[p, a] = c_bar[a]
+
+    @ti.kernel
+    def add_trial_invariants_adjoint(self, s: ti.i32, bar: ti.types.ndarray()):
+        """The adjoint (N, 3) of the trial invariants -> added to ``trial_bar``."""
+        for p in range(bar.shape[0]):
+            value = ti.Vector([bar[p, 0], bar[p, 1], bar[p, 2]])
+            self.mpm.trial_bar[p] += tensor.invariants_adjoint(self.mpm.trial_gradient[s, p], value)

@@ -8,6 +8,7 @@ from pathlib import Path
 from safetensors import SafetensorError, safe_open
 
 from masiv.errors import InputError
+from masiv.materials.adapter import AdapterLaw
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.law import Law
 from masiv.materials.neural import NeuralLaw
@@ -20,12 +21,17 @@ def load_law(path: Path) -> Law:
             metadata = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}
         kind = metadata["kind"]
-        law = (
-            NeuralLaw(width=int(metadata["width"])) if kind == NeuralLaw.kind else ClassicalLaw.from_state(kind, state)
-        )
+        law: Law
+        if kind == NeuralLaw.kind:
+            law = NeuralLaw(width=int(metadata["width"]))
+        elif kind == AdapterLaw.kind:
+            law = AdapterLaw.from_state(metadata, state)
+        else:
+            law = ClassicalLaw.from_state(kind, state)
         law.load_state_dict(state)
-        if isinstance(law, ClassicalLaw):
-            law.stderr = json.loads(metadata.get("stderr", "{}"))
+        estimated = law.base if isinstance(law, AdapterLaw) else law
+        if isinstance(estimated, ClassicalLaw):
+            estimated.stderr = json.loads(metadata.get("stderr", "{}"))
     except (SafetensorError, FileNotFoundError, KeyError, RuntimeError) as error:
         raise InputError(f"{path} is not a law written by masiv ({error}): run identify or pretrain again") from error
     return law
