@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -181,8 +182,8 @@ def fit_parameters(
     upper = [(p.fitted(p.upper) - x) / s for p, x, s in zip(parameters, evaluator.start, evaluator.scale, strict=True)]
     try:
         result = least_squares(
-            evaluator.trial, origin, evaluator.jacobian, (lower, upper), "trf",
-            xtol=STEP_TOLERANCE / FIRST_STEP, ftol=tolerance, gtol=None,
+            evaluator.trial, origin, cast(Any, evaluator.jacobian), (lower, upper), "trf",
+            xtol=STEP_TOLERANCE / FIRST_STEP, ftol=tolerance, gtol=cast(Any, None),
             loss="soft_l1" if robust else "linear", f_scale=softness, max_nfev=max(max_evaluations, 1),
         )  # fmt: skip
         u, found = result.x, result.fun
