@@ -59,7 +59,7 @@ def identify_classical(
     start = AdapterLaw(chosen.law, rank=config.adapter_rank, seed=seed).float()
     start.base.double()
     fitted = fit_weights(
-        problem, start, chosen.motion, chosen.contact, first_frames,
+        problem, start, chosen.motion, chosen.contact, problem.frames,  # the classical law was fitted to all frames
         seed=seed, checkpoint=Beside(checkpoint), progress=progress,
     )  # fmt: skip
     report["classical_error_mm"] = 1e3 * chosen.error_m
