@@ -8,6 +8,7 @@ import torch
 from masiv.effects.active import ActiveEffects
 from masiv.effects.effect import Setting
 from masiv.effects.library import effects
+from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulate import thrown
@@ -29,27 +30,31 @@ def setting(x):
     return Setting(torch.tensor([0.0, -9.8, 0.0], dtype=F64), x, 1e3 * 0.2**3 / len(x), 0.2, STEPS * DT)
 
 
-def simulator(count, contact="sticky"):
-    return Simulator(particle_count=count, spacing=0.05, substep=DT, volume=0.2**3, density=1e3, gravity=(0, -9.8, 0),
-                     contact=contact, dtype=F64, max_substeps=64, grid_nodes=1 << 14)  # fmt: skip
+def simulator(count, contact="sticky", gravity=(0, -9.8, 0), friction=0.3):
+    """One capacity and dtype everywhere: one compile."""
+    return Simulator(particle_count=count, spacing=0.05, substep=DT, volume=0.2**3, density=1e3, gravity=gravity,
+                     contact=contact, friction=friction, dtype=F64, max_substeps=64, grid_nodes=1 << 14)  # fmt: skip
 
 
-def positions(theta, effect, x, outputs=(STEPS,)):
-    """The throw with the effect: position and time shifts are the caller's, so they are applied here."""
+def thrown_body(x):
+    return thrown(x, torch.tensor([0.6, -1.2, 0.3], dtype=F64), torch.tensor([2.0, 1.0, -3.0], dtype=F64))
+
+
+def positions(theta, effect, x, contact="sticky"):
+    """The last positions of the throw with the effect. Shifts of the ground and the clock are the caller's: here."""
     active = ActiveEffects(((effect, theta),), setting(x))
     zero = torch.zeros(1, dtype=F64)
     shift = torch.cat([zero, active.ground_shift().to(F64).reshape(1), zero])
-    velocity = torch.tensor([0.6, -1.2, 0.3], dtype=F64)
-    omega = torch.tensor([2.0, 1.0, -3.0], dtype=F64)
-    state = thrown(x - shift, velocity, omega)
-    return rollout(simulator(len(x)), LAW, state, STEPS, list(outputs), active) + shift
+    before, last = rollout(simulator(len(x), contact), LAW, thrown_body(x - shift), STEPS, [STEPS - 1, STEPS], active)
+    return last + active.time_shift() * (last - before) / DT + shift
 
 
 def present(effect):
-    """Parameters of a clear case of the effect."""
-    first = effect.guesses(setting(body()))[0]
+    """Parameters of a clear case of the effect, at the guess that is nearest to the body's lower end."""
+    x = body()
+    guesses = effect.guesses(setting(x))
     strengths = [8 * p.step for p in effect.parameters[: effect.strengths]]
-    return torch.tensor([*strengths, *first], dtype=F64)
+    return torch.tensor([*strengths, *guesses[0]], dtype=F64)
 
 
 @pytest.mark.parametrize("name", sorted(effects()))
@@ -57,23 +62,78 @@ def test_absent_at_zero_strength(name):
     effect, x = effects()[name], body()
     theta = present(effect)
     theta[: effect.strengths] = 0
-    without = rollout(simulator(len(x)), LAW, thrown(x, torch.tensor([0.6, -1.2, 0.3], dtype=F64),
-                      torch.tensor([2.0, 1.0, -3.0], dtype=F64)), STEPS, [STEPS])  # fmt: skip
+    without = rollout(simulator(len(x)), LAW, thrown_body(x), STEPS, [STEPS])[0]
     torch.testing.assert_close(positions(theta, effect, x), without, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", sorted(n for n, e in effects().items() if e.on_grid or e.on_stress or n == "point_mass"))
-def test_gradient_by_finite_differences(name):
+CASES = [(name, "sticky") for name in effects()]
+CASES += [(name, c) for name, e in effects().items() if e.on_grid == "ground" for c in ("release", "slip")]
+
+
+@pytest.mark.parametrize(("name", "contact"), CASES)
+def test_gradient_by_finite_differences(name, contact):
     effect, x = effects()[name], body()
     theta = present(effect).requires_grad_()
-    weights = torch.rand(1, len(x), 3, generator=torch.Generator().manual_seed(2), dtype=F64)
+    weights = torch.rand(len(x), 3, generator=torch.Generator().manual_seed(2), dtype=F64)
 
     def loss(value):
-        return (weights * positions(value, effect, x)).sum()
+        return (weights * positions(value, effect, x, contact)).sum()
 
     loss(theta).backward()
-    for i, parameter in enumerate(effect.parameters):
-        step = torch.zeros_like(theta)
-        step[i] = 1e-3 * parameter.step
-        slope = (loss(theta.detach() + step) - loss(theta.detach() - step)) / (2 * step[i])
-        assert theta.grad[i].item() == pytest.approx(slope.item(), rel=2e-4, abs=1e-7 / parameter.step), parameter.name
+    with torch.no_grad():
+        for i, parameter in enumerate(effect.parameters):
+            step = torch.zeros_like(theta)
+            step[i] = 1e-3 * parameter.step
+            slope = (loss(theta + step) - loss(theta - step)) / (2 * step[i])
+            expected = pytest.approx(slope.item(), rel=2e-4, abs=1e-7 / parameter.step)
+            assert theta.grad[i].item() == expected, parameter.name
+            # a parameter that moves nothing would pass for any gradient
+            assert abs(slope) * parameter.step > 1e-5, parameter.name
+
+
+@pytest.mark.parametrize("name", sorted(effects()))
+def test_declaration(name):
+    """What the search for causes relies on: steps, bounds that allow zero strength, few guesses, complete ones."""
+    effect = effects()[name]
+    assert effect.name == name
+    assert effect.looks_like
+    assert len({p.name for p in effect.parameters}) == len(effect.parameters)
+    for p in effect.parameters:
+        assert p.unit
+        assert p.lower < p.upper
+        assert 0 < p.step <= p.upper
+    assert all(p.lower <= 0 <= p.upper for p in effect.parameters[: effect.strengths])
+    guesses = effect.guesses(setting(body()))
+    assert 1 <= len(guesses) <= 12
+    for guess in guesses:
+        located = list(zip(effect.parameters[effect.strengths :], guess, strict=True))
+        assert all(p.lower <= value <= p.upper for p, value in located)
+
+
+def test_two_effects_cannot_both_be_the_contact():
+    x = body()
+    zero = torch.zeros(1, dtype=F64)
+    members = tuple((effects()[name], zero) for name in ("restitution", "ground_friction"))
+    with pytest.raises(InputError, match="both replace the contact"):
+        ActiveEffects(members, setting(x))
+
+
+def test_several_effects_at_once():
+    """Grid, ground, stress and masses in one rollout: each gradient against finite differences."""
+    x = body()
+    names = ("linear_drag", "ground_friction", "viscosity", "point_mass", "swirl")
+    thetas = [present(effects()[name]).requires_grad_() for name in names]
+
+    def loss(values):
+        active = ActiveEffects(tuple((effects()[n], v) for n, v in zip(names, values, strict=True)), setting(x))
+        return rollout(simulator(len(x)), LAW, thrown_body(x), STEPS, [STEPS], active).square().sum()
+
+    loss(thetas).backward()
+    with torch.no_grad():
+        for k, name in enumerate(names):
+            step = 1e-3 * effects()[name].parameters[0].step
+            up, down = ([t.clone() for t in thetas] for _ in range(2))
+            up[k][0] += step
+            down[k][0] -= step
+            slope = (loss(up) - loss(down)) / (2 * step)
+            assert thetas[k].grad[0].item() == pytest.approx(slope.item(), rel=2e-4), name

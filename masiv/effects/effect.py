@@ -12,8 +12,10 @@ import torch
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """A number of an effect. ``step`` is a change that a video of an object of half a metre can just show; ``lower``
-    and ``upper`` are what is physically possible; ``start`` where a search begins (a strength begins at 0)."""
+    """A number of an effect. ``step`` is a change that a video of an object of half a metre can just show (about 1 mm);
+    ``lower`` and ``upper`` are what is physically possible; ``start`` where a search begins (a strength begins at 0).
+
+    Vectors and places are in the simulation frame: y is up, and the ground that the model has is at y = 0."""
 
     name: str
     unit: str
@@ -26,13 +28,16 @@ class EffectParameter:
 @dataclass(frozen=True)
 class Setting:
     """What an effect may know of the scene, simulation frame (y up, ground at y = 0), SI units: gravity (3,), positions
-    ``rest`` (N, 3) and mass of the particles at frame 0, size of the body, and how long it is watched [s]."""
+    ``rest`` (N, 3) and mass of the particles at frame 0, size of the body, how long it is watched [s], the time between
+    two frames [s], and ``path`` (T, M, 3), where some of its points were seen (None: not known)."""
 
     gravity: torch.Tensor
     rest: torch.Tensor
     particle_mass: float
     size: float
     duration: float
+    frame_time: float = 1 / 24
+    path: torch.Tensor | None = None
 
 
 class Effect(ABC):
@@ -51,7 +56,7 @@ class Effect(ABC):
     on_stress: ClassVar[bool] = False
 
     def node_velocity(self) -> Callable[..., Any]:
-        """Taichi function (x, v, held, t, dt, c) -> v, see ``masiv.kernels.effects.NodeKernels``."""
+        """Taichi function (x, v, held, t, dt, dx, c) -> v, see ``masiv.kernels.effects.NodeKernels``."""
         raise NotImplementedError
 
     def particle_stress(self) -> Callable[..., Any]:

@@ -6,7 +6,7 @@ from masiv.effects.effect import Effect, EffectParameter
 
 
 @ti.func
-def _slowed(x, v, held, t, dt, c):
+def _slowed(x, v, held, t, dt, dx, c):
     return ti.exp(-c[0] * dt) * v
 
 

@@ -67,10 +67,11 @@ class OpenGrid:
 
 @ti.data_oriented
 class NodeKernels:
-    """``function(x, v, held, t, dt, c) -> v`` on the nodes of the grid: position [m], velocity [m/s] after gravity and
-    earlier effects, the velocity that the ground's contact would give, time [s], substep [s], coefficients.
+    """``function(x, v, held, t, dt, dx, c) -> v`` on the nodes of the grid: position [m], velocity [m/s] after gravity
+    and earlier effects, the velocity that the ground's contact would give, time [s], substep [s], cell [m], and the
+    coefficients.
 
-    grounded: the function is the ground's contact and is applied to nodes on or below it alone.
+    grounded: the function is the ground's contact and is applied to nodes on or below it alone; otherwise held is v.
     """
 
     def __init__(self, mpm, function, coefficients: int, grounded: bool):
@@ -78,24 +79,30 @@ class NodeKernels:
         self.function = function
         self.grounded = grounded
         self.n = coefficients
-        self.c = ti.field(mpm.real, shape=coefficients)
-        capacity, real = mpm.capacity_nodes, mpm.real
-        self.before = ti.Vector.field(3, real, shape=capacity, needs_grad=True)
-        self.after = ti.Vector.field(3, real, shape=capacity, needs_grad=True)
-        self.coefficients = ti.Vector.field(coefficients, real, shape=capacity, needs_grad=True)
-        self.total = ti.field(real, shape=coefficients)
+        self.capacity = mpm.capacity_nodes
+        self.before = ti.Vector.field(3, mpm.real, shape=self.capacity, needs_grad=True)
+        self.held = ti.Vector.field(3, mpm.real, shape=self.capacity, needs_grad=True)
+        self.after = ti.Vector.field(3, mpm.real, shape=self.capacity, needs_grad=True)
+        # A copy a node; its gradient is summed over substeps in place, and over nodes when it is read.
+        self.coefficients = ti.Vector.field(coefficients, mpm.real, shape=self.capacity, needs_grad=True)
 
     @ti.kernel
     def write(self, values: ti.types.ndarray()):
         """values (K,); the sums of their gradients start at zero."""
-        for i in range(values.shape[0]):
-            self.c[i] = values[i]
-            self.total[i] = 0.0
+        for n in range(self.capacity):
+            for i in ti.static(range(self.n)):
+                self.coefficients[n][i] = values[i]
+                self.coefficients.grad[n][i] = 0.0
 
     @ti.kernel
     def read_gradient(self, out: ti.types.ndarray()):
-        for i in range(out.shape[0]):
-            out[i] = self.total[i]
+        """out (K,)."""
+        total = ti.Vector.zero(self.mpm.real, self.n)
+        ti.loop_config(serialize=True)  # in order: the sum is the same to the bit
+        for n in range(self.capacity):
+            total += self.coefficients.grad[n]
+        for i in ti.static(range(self.n)):
+            out[i] = total[i]
 
     @ti.func
     def node_position(self, n: ti.i32):
@@ -107,11 +114,23 @@ class NodeKernels:
         return ti.Vector([(origin[0] + i) * dx, (origin[1] + j) * dx, (origin[2] + k) * dx])
 
     @ti.func
-    def concerns(self, x):
+    def concerns(self, n: ti.i32):
         out = True
         if ti.static(self.grounded):
-            out = self.mpm.contact[None] != NO_GROUND and x[1] < 0.5 * self.mpm.constants[DX]
+            row = n // self.mpm.window_shape[None][2]
+            out = self.mpm.contact[None] != NO_GROUND and self.mpm.node_height(row) <= 0
         return out
+
+    @ti.func
+    def result(self, n: ti.i32, t: ti.f64):
+        """The function at node n, of ``before``, ``held`` and ``coefficients``."""
+        v = self.before[n]
+        held = v
+        if ti.static(self.grounded):
+            held = self.held[n]
+        dt, dx = self.mpm.constants[DT], self.mpm.constants[DX]
+        x = self.node_position(n)
+        return self.function(x, v, held, ti.cast(t, self.mpm.real), dt, dx, self.coefficients[n])
 
     @ti.kernel
     def apply(self, nodes: ti.i32, t: ti.f64):
@@ -119,46 +138,35 @@ class NodeKernels:
         for n in range(nodes):
             v = momentum_of(self.mpm.grid_velocity[n])
             self.before[n] = v
-            x = self.node_position(n)
-            out = v
-            if self.concerns(x):
-                c = ti.Vector.zero(self.mpm.real, self.n)
-                for i in ti.static(range(self.n)):
-                    c[i] = self.c[i]
-                held = self.mpm.contact_velocity(v)
-                out = self.function(x, v, held, ti.cast(t, self.mpm.real), self.mpm.constants[DT], c)
-            self.mpm.grid_velocity[n] = ti.Vector([out[0], out[1], out[2], 0.0])
+            if self.concerns(n):
+                if ti.static(self.grounded):
+                    self.held[n] = self.mpm.contact_velocity(v)
+                out = self.result(n, t)
+                self.mpm.grid_velocity[n] = ti.Vector([out[0], out[1], out[2], 0.0])
 
     @ti.kernel
     def load(self, nodes: ti.i32):
+        zero = ti.Vector.zero(self.mpm.real, 3)
         for n in range(nodes):
             self.after.grad[n] = self.mpm.grid_velocity_bar[n]
-            self.before.grad[n] = ti.Vector.zero(self.mpm.real, 3)
-            for i in ti.static(range(self.n)):
-                self.coefficients[n][i] = self.c[i]
-                self.coefficients.grad[n][i] = 0.0
+            self.before.grad[n] = zero
+            self.held.grad[n] = zero
 
     @ti.kernel
     def pointwise(self, nodes: ti.i32, t: ti.f64):
         for n in range(nodes):
-            x = self.node_position(n)
-            v = self.before[n]
-            if self.concerns(x):
-                held = self.mpm.contact_velocity(v)
-                self.after[n] = self.function(
-                    x, v, held, ti.cast(t, self.mpm.real), self.mpm.constants[DT], self.coefficients[n]
-                )
+            if self.concerns(n):
+                self.after[n] = self.result(n, t)
             else:
-                self.after[n] = v
+                self.after[n] = self.before[n]
 
     @ti.kernel
     def store(self, nodes: ti.i32):
         for n in range(nodes):
-            self.mpm.grid_velocity_bar[n] = self.before.grad[n]
-        ti.loop_config(serialize=True)  # in order: the sum is the same to the bit
-        for n in range(nodes):
-            for i in ti.static(range(self.n)):
-                self.total[i] += self.coefficients.grad[n][i]
+            bar = self.before.grad[n]
+            if ti.static(self.grounded):
+                bar += self.mpm.contact_adjoint(self.before[n], self.held.grad[n])
+            self.mpm.grid_velocity_bar[n] = bar
 
     def adjoint(self, nodes: int, t: float) -> None:
         """``grid_velocity_bar`` after the effect -> before it, from ``before`` as ``apply`` left it."""

@@ -1,0 +1,16 @@
+"""A clock that is off."""
+
+from __future__ import annotations
+
+from masiv.effects.effect import Effect, EffectParameter
+
+
+class TimeOffset(Effect):
+    """The frame stamped t was taken at t + theta, counted from the instant at which the body starts."""
+
+    name = "time_offset"
+    looks_like = "the motion is right but early or late by the same time throughout, most visible where it is fast"
+    parameters = (EffectParameter("delay", "s", -0.1, 0.1, 0.0005),)
+
+    def time_shift(self, theta):
+        return theta[0]
