@@ -21,19 +21,24 @@ def inspect(
     seed: SeedOption = None,
     as_json: JsonOption = False,
 ) -> tuple[dict[str, Any], str]:
-    """Say what was read: cameras, frames, units, up axis, masks, problems; and draw it.
+    """Say what was read: cameras or markers, frames, units, up axis, masks, problems; and draw it.
 
     Example: `masiv inspect scenes/bunny --out bunny.png`
     """
     from masiv.config import load_config
     from masiv.report.contact_sheet import write_contact_sheet
-    from masiv.scene.read import read_scene
+    from masiv.scene.read import read_observation
     from masiv.scene.summary import as_text, summarise
+    from masiv.tracks.summary import summarise_tracks, tracks_as_text, write_tracks_picture
+    from masiv.tracks.tracks import Tracks
 
     load_config(preset, config, seed=seed, arch=arch)
-    read = read_scene(scene)
-    summary = summarise(read)
+    read = read_observation(scene)
     target = out or Path(f"{scene.resolve().stem if scene.is_file() else scene.resolve().name}_inspect.png")
+    if isinstance(read, Tracks):
+        write_tracks_picture(read, target)
+        summary = {**summarise_tracks(read), "picture": str(target)}
+        return summary, tracks_as_text(summary)
     write_contact_sheet(read, target)
-    summary["picture"] = str(target)
+    summary = {**summarise(read), "picture": str(target)}
     return summary, as_text(summary)

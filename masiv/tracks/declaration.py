@@ -1,0 +1,170 @@
+"""The ``scene.yaml`` of a scene of tracks. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+
+from masiv.scene.declaration import GroundDeclaration, SceneDeclaration, Vector
+
+Unit = Literal["m", "cm", "mm"]
+METRES: dict[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+Axis = Literal["x", "y", "z"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CylinderDeclaration(_Part):
+    """Its axis is z, its middle the origin."""
+
+    diameter: Positive
+    length: Positive
+
+
+class HalfSpaceDeclaration(_Part):
+    """Everything at normal·x ≤ height."""
+
+    normal: Vector
+    height: FiniteFloat
+
+
+class ClampDeclaration(_Part):
+    """What is held. ``half_space`` or ``box`` (two opposite corners) in the geometry's own axes and units; ``markers``:
+    those fixed to the clamp, which do not move with the material."""
+
+    half_space: HalfSpaceDeclaration | None = None
+    box: tuple[Vector, Vector] | None = None
+    markers: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_region(self) -> ClampDeclaration:
+        if (self.half_space is None) == (self.box is None):
+            raise ValueError("give one of half_space and box")
+        return self
+
+
+class GeometryDeclaration(_Part):
+    """The body at rest: one of ``mesh`` (a watertight STL, OBJ, PLY; relative to the scene), ``box`` (its three sides),
+    ``sphere`` (its diameter) and ``cylinder``; a primitive's origin is its middle. ``units`` are those of all numbers
+    here but ``position``, of the mesh file and of the clamp.
+
+    Where it is in the world: ``markers_at`` says where markers sit on it (one: it is moved there; three or more: the
+    best rigid motion onto their rest positions); or ``position`` [m] of its origin. ``rotation_deg`` about the fixed
+    axes x, then y, then z.
+    """
+
+    units: Unit
+    mesh: Path | None = None
+    box: tuple[Positive, Positive, Positive] | None = None
+    sphere: Positive | None = None
+    cylinder: CylinderDeclaration | None = None
+    markers_at: dict[str, Vector] | None = None
+    position: Vector | None = None
+    rotation_deg: Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> GeometryDeclaration:
+        if sum(shape is not None for shape in (self.mesh, self.box, self.sphere, self.cylinder)) != 1:
+            raise ValueError("give one of mesh, box, sphere and cylinder")
+        if self.markers_at is not None:
+            if self.position is not None:
+                raise ValueError("markers_at and position say the same thing: give one of them")
+            if len(self.markers_at) in (0, 2):
+                raise ValueError("markers_at takes one marker, or three and more")
+            if len(self.markers_at) > 2 and self.rotation_deg is not None:
+                raise ValueError("rotation_deg follows from three markers: leave it out")
+        return self
+
+
+class BodyDeclaration(_Part):
+    """One object. ``density`` [kg/m³] or ``mass`` [kg]. ``group``: bodies of a group share the laws of their
+    surroundings (a drag of balls, say); alone by default."""
+
+    geometry: GeometryDeclaration | None = None
+    density: Positive | None = None
+    mass: Positive | None = None
+    poissons_ratio: Annotated[FiniteFloat, Field(gt=-1, lt=0.5)] | None = None
+    group: str | None = None
+    clamp: ClampDeclaration | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> BodyDeclaration:
+        if self.density is not None and self.mass is not None:
+            raise ValueError("give density or mass, not both")
+        if self.clamp is not None and self.geometry is None:
+            raise ValueError("a clamp needs a geometry")
+        return self
+
+
+class ColumnsDeclaration(_Part):
+    """Names of a CSV's columns. ``markers``: marker -> axis -> column; an axis that was not measured is left out."""
+
+    time: str | None = None
+    markers: dict[str, dict[Axis, str]]
+
+    @field_validator("markers")
+    @classmethod
+    def _some(cls, value: dict[str, dict[Axis, str]]) -> dict[str, dict[Axis, str]]:
+        if not value or not all(value.values()):
+            raise ValueError("name one marker or more, each with one axis or more")
+        return value
+
+
+class RunDeclaration(_Part):
+    """One recording. ``file``: CSV or C3D, relative to the scene. ``select``: only the rows whose columns have these
+    values. ``use``: fit on it, or hold it out. ``condition``: runs of a condition share what was done to the body (a
+    load, a wind). ``markers``: keep only these. ``rest_frames`` [first, last): the body is held at rest there;
+    ``release_time`` [s, the file's]: it is let go, found in the data where it is left out. ``time`` [s]: use only from
+    the first to the second."""
+
+    file: Path
+    name: str | None = None
+    body: str | None = None
+    use: Literal["fit", "hold_out"] = "fit"
+    condition: str = ""
+    select: dict[str, str | int | float] = {}
+    markers: tuple[str, ...] | None = None
+    rest_frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = None
+    release_time: FiniteFloat | None = None
+    time: tuple[FiniteFloat, FiniteFloat] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> RunDeclaration:
+        for name in ("rest_frames", "time"):
+            pair = getattr(self, name)
+            if pair is not None and not pair[0] < pair[1]:
+                raise ValueError(f"{name}: the second must be greater than the first")
+        return self
+
+
+class TracksDeclaration(_Part):
+    """Keys of the ``scene.yaml`` of tracks; ``layout: tracks`` is what it is known by.
+
+    units: of positions in the files, where they do not say it (a CSV by columns such as tip_x_mm). rate [Hz]: where
+    files have no time. up_axis (z by default), gravity (9.8 down by default), ground (none by default): as of a scene
+    of pictures.
+    """
+
+    layout: Literal["tracks"]
+    units: Unit | None = None
+    rate: Positive | None = None
+    up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | Vector | None = None
+    gravity: FiniteFloat | Vector | None = None
+    ground: Literal["none"] | GroundDeclaration | None = None
+    columns: ColumnsDeclaration | None = None
+    bodies: dict[str, BodyDeclaration] = Field(min_length=1)
+    runs: tuple[RunDeclaration, ...] = Field(min_length=1)
+
+    @field_validator("up_axis", mode="before")
+    @classmethod
+    def _plus_sign(cls, value: object) -> object:
+        return value.strip().lstrip("+") if isinstance(value, str) else value
+
+    def surroundings(self) -> SceneDeclaration:
+        """Up axis, gravity and ground, with the functions that read them."""
+        return SceneDeclaration(up_axis=self.up_axis, gravity=self.gravity, ground=self.ground)

@@ -1,0 +1,91 @@
+"""Shape of a body at rest, in its own axes. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from masiv.errors import InputError
+from masiv.tracks.declaration import METRES, GeometryDeclaration
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A solid in its own axes. kind: mesh, box, sphere or cylinder; vertices (V, 3) [m] and faces (F, 3) of its surface
+    (a primitive's is approximate); volume [m³], exact; lower, upper: corners (3,) [m] of its bounding box."""
+
+    kind: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    volume: float
+    lower: np.ndarray
+    upper: np.ndarray
+
+    @property
+    def size(self) -> float:
+        """Longest side of the bounding box [m]."""
+        return float((self.upper - self.lower).max())
+
+    def lattice_inside(self, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cells of a lattice that divides the bounding box in ``counts`` (3,) parts.
+
+        Centres (counts[0], counts[1], counts[2], 3) [m], and which of them are inside, bool.
+        """
+        cell = (self.upper - self.lower) / counts
+        index = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in counts], indexing="ij"), axis=-1)
+        centres = self.lower + cell * index
+        if self.kind == "box":
+            return centres, np.ones(centres.shape[:3], bool)
+        if self.kind == "sphere":
+            return centres, (centres**2).sum(-1) <= (0.5 * self.size) ** 2
+        if self.kind == "cylinder":
+            return centres, (centres[..., :2] ** 2).sum(-1) <= self.upper[0] ** 2
+        return centres, self._inside_mesh(counts)
+
+    def _inside_mesh(self, counts: np.ndarray) -> np.ndarray:
+        import trimesh
+
+        from masiv.synth.shapes import _inside
+
+        # Crossings keep their parity when each axis is scaled by itself, so cells become unit cubes.
+        scaled = (self.vertices - self.lower) * (counts / (self.upper - self.lower))
+        cube = _inside(trimesh.Trimesh(scaled, self.faces, process=False), np.arange(counts.max()) + 0.5)
+        return cube[: counts[0], : counts[1], : counts[2]]
+
+
+def make_geometry(declared: GeometryDeclaration, folder: Path) -> Geometry:
+    """The solid that ``declared`` says; mesh files are relative to ``folder``. Raises InputError for an unusable mesh."""
+    import trimesh
+
+    unit = METRES[declared.units]
+    if declared.box is not None:
+        sides = unit * np.array(declared.box)
+        return _primitive("box", trimesh.creation.box(sides), float(sides.prod()), sides / 2)
+    if declared.sphere is not None:
+        radius = unit * declared.sphere / 2
+        mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+        return _primitive("sphere", mesh, 4 / 3 * math.pi * radius**3, np.full(3, radius))
+    if declared.cylinder is not None:
+        radius, length = unit * declared.cylinder.diameter / 2, unit * declared.cylinder.length
+        mesh = trimesh.creation.cylinder(radius=radius, height=length, sections=48)
+        return _primitive("cylinder", mesh, math.pi * radius**2 * length, np.array([radius, radius, length / 2]))
+    assert declared.mesh is not None
+    path = folder / declared.mesh
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: correct geometry.mesh in scene.yaml")
+    try:
+        mesh = trimesh.load(path, force="mesh")
+    except Exception as error:  # its readers raise what they like
+        raise InputError(f"{path} is not a triangle mesh that can be read: {error}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not mesh.is_watertight:
+        raise InputError(f"{path} is not watertight, so it has no inside: close its holes first")
+    vertices = unit * np.array(mesh.vertices, np.float64)
+    volume = abs(float(mesh.volume)) * unit**3
+    return Geometry("mesh", vertices, np.array(mesh.faces), volume, vertices.min(0), vertices.max(0))
+
+
+def _primitive(kind: str, mesh, volume: float, half: np.ndarray) -> Geometry:
+    return Geometry(kind, np.array(mesh.vertices, np.float64), np.array(mesh.faces), volume, -half, half)

@@ -1,0 +1,169 @@
+"""Files of measured points: CSV and C3D. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+import csv
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from masiv.errors import InputError
+from masiv.tracks.declaration import ColumnsDeclaration
+
+_POSITION = re.compile(r"^(?P<marker>.+?)[ _.:](?P<axis>[xyzXYZ])(?:[ _]?[\[(]?(?P<unit>mm|cm|m)[\])]?)?$")
+_UNIT = re.compile(r"[ _]?[\[(]?(?P<unit>mm|cm|m)[\])]?$")
+_TIME = re.compile(r"^(time|t)(?:[ _]?[\[(]?(?P<unit>s|ms)[\])]?)?$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A file as it is: positions (T, M, 3) in ``unit`` (None: the file does not say), NaN where nothing was measured;
+    times (T,) [s] or None; rate [Hz] or None; ignored: columns that are not positions."""
+
+    markers: tuple[str, ...]
+    positions: np.ndarray
+    times: np.ndarray | None
+    rate: float | None
+    unit: str | None
+    ignored: tuple[str, ...] = ()
+
+
+def read_table(path: Path, columns: ColumnsDeclaration | None, select: Mapping[str, str | int | float]) -> Table:
+    """The points in ``path``, by its ending. Raises InputError where it cannot be read."""
+    ending = path.suffix.lower()
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: correct runs.file in scene.yaml")
+    if ending == ".csv":
+        return read_csv(path, columns, select)
+    if ending == ".c3d":
+        if select or columns is not None:
+            raise InputError(f"{path}: a C3D file has no columns: leave out columns and select")
+        return read_c3d(path)
+    raise InputError(f"{path}: tracks are read from .csv and .c3d files: convert it to CSV")
+
+
+def read_csv(path: Path, columns: ColumnsDeclaration | None, select: Mapping[str, str | int | float]) -> Table:
+    """One header row; columns named ``columns``, or such as ``tip1_x_m`` and ``time_s``. An empty cell is a gap."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} is not a CSV file that can be read: {error}") from error
+    if len(rows) < 2:
+        raise InputError(f"{path} has no rows of data under its header")
+    header = [name.strip() for name in rows[0]]
+    if len(set(header)) < len(header):
+        raise InputError(f"{path}: two columns have the same name: give each its own")
+    for line, row in enumerate(rows[1:], start=2):
+        if len(row) != len(header):
+            raise InputError(f"{path}: row {line} has {len(row)} cells, the header has {len(header)}")
+    body = list(enumerate(rows[1:], start=2))
+    for column, value in select.items():
+        k = _index(path, header, column)
+        body = [(line, row) for line, row in body if _same(row[k].strip(), value)]
+    if not body:
+        raise InputError(f"{path}: no row has {', '.join(f'{c} = {v}' for c, v in select.items())}")
+    layout, units, time = _declared(columns) if columns is not None else _by_name(path, header)
+    markers = tuple(layout)
+    positions = np.full((len(body), len(markers), 3), np.nan)
+    for m, axes in enumerate(layout.values()):
+        for axis, column in axes.items():
+            positions[:, m, "xyz".index(axis)] = _numbers(path, body, _index(path, header, column), column)
+    if len(units) > 1:
+        raise InputError(f"{path}: columns are in {' and '.join(sorted(units))}: give them one unit")
+    times = None
+    if time is not None:
+        times = _numbers(path, body, _index(path, header, time), time)
+        if _unit_of_time(time) == "ms":
+            times = times / 1e3
+    used = {column for axes in layout.values() for column in axes.values()} | {time} | set(select)
+    ignored = () if columns is not None else tuple(name for name in header if name not in used)
+    return Table(markers, positions, times, None, next(iter(units), None), ignored)
+
+
+def read_c3d(path: Path) -> Table:
+    """Points of a C3D file. A negative residual marks a gap. Needs the package ``c3d``."""
+    try:
+        import c3d
+    except ImportError as error:
+        raise InputError(
+            f"{path}: reading C3D needs the package c3d: `pip install c3d`, or export the markers as CSV"
+        ) from error
+    try:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it warns where there are no analog channels
+            reader = c3d.Reader(file)
+            labels = tuple(" ".join(label.split()) for label in reader.point_labels)
+            frames = [np.array(points, np.float64) for _, points, _ in reader.read_frames()]
+            unit = reader.get("POINT:UNITS")
+            rate = float(reader.point_rate)
+            first = int(reader.first_frame)
+    except (OSError, AssertionError, ValueError, KeyError, IndexError, AttributeError) as error:
+        raise InputError(f"{path} is not a C3D file that can be read: {error}") from error
+    if not frames:
+        raise InputError(f"{path} has no frames")
+    points = np.stack(frames)[:, : len(labels)]
+    positions = np.where(points[:, :, 3:4] < 0, np.nan, points[:, :, :3])
+    name = None if unit is None else unit.string_value.strip().lower()
+    times = (first - 1 + np.arange(len(frames))) / rate
+    return Table(labels, positions, times, rate, name if name in ("m", "cm", "mm") else None)
+
+
+def _declared(columns: ColumnsDeclaration) -> tuple[dict[str, dict[str, str]], set[str], str | None]:
+    layout = {marker: dict(axes) for marker, axes in columns.markers.items()}
+    found = [_UNIT.search(column) for axes in layout.values() for column in axes.values()]
+    return layout, {match["unit"] for match in found if match and match.group() != match.string}, columns.time
+
+
+def _by_name(path: Path, header: list[str]) -> tuple[dict[str, dict[str, str]], set[str], str | None]:
+    layout: dict[str, dict[str, str]] = {}
+    units, time = set(), None
+    for column in header:
+        if match := _POSITION.match(column):
+            layout.setdefault(match["marker"], {})[match["axis"].lower()] = column
+            if match["unit"]:
+                units.add(match["unit"])
+        elif time is None and _TIME.match(column):
+            time = column
+    if not layout:
+        raise InputError(f"{path}: no column is named like tip1_x_m: name them so, or say columns in scene.yaml")
+    return layout, units, time
+
+
+def _unit_of_time(column: str) -> str:
+    match = _TIME.match(column)
+    return (match["unit"] or "s").lower() if match else "s"
+
+
+def _index(path: Path, header: list[str], column: str) -> int:
+    if column not in header:
+        raise InputError(f"{path} has no column '{column}': it has {', '.join(header)}")
+    return header.index(column)
+
+
+def _same(cell: str, value: str | int | float) -> bool:
+    if isinstance(value, str):
+        return cell == value
+    try:
+        return float(cell) == float(value)
+    except ValueError:
+        return False
+
+
+def _numbers(path: Path, body: list[tuple[int, list[str]]], k: int, column: str) -> np.ndarray:
+    out = np.full(len(body), np.nan)
+    for i, (line, row) in enumerate(body):
+        cell = row[k].strip()
+        if cell.lower() in ("", "nan"):
+            continue
+        try:
+            out[i] = float(cell)
+        except ValueError:
+            raise InputError(f"{path}: row {line}, column {column}: '{cell}' is not a number") from None
+        if np.isinf(out[i]):
+            raise InputError(f"{path}: row {line}, column {column} is infinite: leave the cell empty for a gap")
+    return out

@@ -1,0 +1,147 @@
+"""What was measured: points on bodies over time. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from masiv.errors import InputError
+from masiv.scene.scene import Ground
+from masiv.tracks.geometry import Geometry
+from masiv.tracks.placement import Placement
+
+
+@dataclass(frozen=True)
+class Clamp:
+    """What is held: {x : normals x ≤ heights}, in the body's own axes: normals (P, 3) unit, heights (P,) [m].
+    ``markers``: those fixed to the clamp."""
+
+    normals: np.ndarray
+    heights: np.ndarray
+    markers: tuple[str, ...]
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """Which points (..., 3) [m, own axes] are inside, bool (...)."""
+        return (points @ self.normals.T <= self.heights).all(axis=-1)
+
+
+@dataclass(frozen=True)
+class Body:
+    """One object; what is None is not known. density [kg/m³]; mass [kg]; bodies of one ``group`` share the laws of
+    their surroundings. Where ``geometry`` and one of density and mass are known, so is the other."""
+
+    name: str
+    group: str
+    geometry: Geometry | None
+    density: float | None
+    mass: float | None
+    poissons_ratio: float | None
+    clamp: Clamp | None
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording of one body. World axes, metres, seconds.
+
+    positions (T, M, 3), NaN where nothing was measured; times (T,) as in the file, increasing; rate [Hz]; purpose: fit
+    or hold_out; rest: frames at rest before the release; release [s]: when the body is let go (None: not known);
+    placement: the body's own axes -> world at rest (None: no geometry, or its marker was never seen).
+    """
+
+    name: str
+    body: str
+    condition: str
+    purpose: str
+    markers: tuple[str, ...]
+    times: np.ndarray
+    positions: np.ndarray
+    rate: float
+    rest: slice | None
+    release: float | None
+    placement: Placement | None
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Which axes of which marker were measured in any frame, (M, 3) bool."""
+        return np.isfinite(self.positions).any(axis=0)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Frames where a marker has all of its axes, (T, M) bool."""
+        return (np.isfinite(self.positions) | ~self.axes).all(axis=2) & self.axes.any(axis=1)
+
+    def rest_positions(self) -> np.ndarray:
+        """Where markers are at rest, (M, 3) [m]: the mean of the rest frames, or the first frame where each was seen.
+        NaN for an axis that was not measured in them."""
+        if self.rest is not None:
+            return _mean(self.positions[self.rest])
+        first = np.argmax(np.isfinite(self.positions), axis=0)
+        return np.take_along_axis(self.positions, first[None], axis=0)[0]
+
+    def noise(self) -> np.ndarray | None:
+        """Standard deviation of each axis in the rest frames, (M, 3) [m]; None without two rest frames."""
+        if self.rest is None or self.rest.stop - self.rest.start < 2:
+            return None
+        at_rest = self.positions[self.rest]
+        known = np.isfinite(at_rest)
+        count = known.sum(0)
+        off = np.where(known, at_rest - _mean(at_rest), 0.0)
+        return np.sqrt(np.where(count > 1, (off**2).sum(0) / np.maximum(count - 1, 1), np.nan))
+
+    def between(self, start: float, stop: float) -> Run:
+        """The frames from ``start`` to ``stop`` [s]; rest frames and release stay where they fall within it."""
+        inside = np.flatnonzero((self.times >= start) & (self.times <= stop))
+        if len(inside) < 2:
+            raise InputError(f"run {self.name} has fewer than two frames from {start:g} to {stop:g} s: widen them")
+        first, last = int(inside[0]), int(inside[-1]) + 1
+        rest = None
+        if self.rest is not None and min(self.rest.stop, last) > max(self.rest.start, first):
+            rest = slice(max(self.rest.start, first) - first, min(self.rest.stop, last) - first)
+        return replace(self, times=self.times[first:last], positions=self.positions[first:last], rest=rest)
+
+    def moving(self) -> Run:
+        """The frames from the release on; all of them where it is not known. The placement stays."""
+        return self if self.release is None else self.between(self.release, np.inf)
+
+    def marker(self, name: str) -> int:
+        """The index of a marker. Raises InputError for an unknown one."""
+        if name not in self.markers:
+            raise InputError(f"run {self.name} has no marker '{name}': it has {', '.join(self.markers)}")
+        return self.markers.index(name)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """A scene of measured points. up (3,) unit; gravity (3,) [m/s²]; ground: the plane, or None."""
+
+    path: Path
+    up: np.ndarray
+    gravity: np.ndarray
+    ground: Ground | None
+    bodies: dict[str, Body]
+    runs: tuple[Run, ...]
+    problems: tuple[str, ...] = ()
+
+    layout = "tracks"
+
+    def chosen(self, purpose: str, *, body: str | None = None, condition: str | None = None) -> tuple[Run, ...]:
+        """Runs by purpose (fit, hold_out) and, where given, by body and condition."""
+        return tuple(
+            run
+            for run in self.runs
+            if run.purpose == purpose and body in (None, run.body) and condition in (None, run.condition)
+        )
+
+    def groups(self) -> dict[str, tuple[Body, ...]]:
+        """Bodies by the group in which they share the laws of their surroundings."""
+        names = dict.fromkeys(body.group for body in self.bodies.values())
+        return {name: tuple(b for b in self.bodies.values() if b.group == name) for name in names}
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Mean over the first axis of what is finite; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(0)
+    return np.where(count > 0, np.where(known, values, 0.0).sum(0) / np.maximum(count, 1), np.nan)
