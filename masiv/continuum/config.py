@@ -23,6 +23,6 @@ class TrajectoryConfig(BaseModel):
     silhouette_weight: float = Field(1.0, ge=0, description="particles outside of a mask")
     motion_weight: float = Field(0.3, ge=0, description="surface motion that the pictures gave stays")
     smoothness_weight: float = Field(0.3, ge=0, description="second differences of the motion")
-    volume_weight: float = Field(0.3, ge=0, description="change of volume")
+    volume_weight: float = Field(1.0, ge=0, description="change of volume")
     rigidity_weight: float = Field(0.02, ge=0, description="strain; weak, since the material may flow")
     ground_weight: float = Field(10.0, ge=0, description="particles below the ground")
