@@ -1,0 +1,187 @@
+"""Which effect does refine name? Simulated throws with undeclared effects, as tracks with correlated noise.
+
+    python benchmarks/refine_tracks.py --out FILE.jsonl [--only NAME] [--particles 1500]
+
+One JSON line a case; cases already in FILE are skipped, so that a stopped run goes on. ``--table FILE`` prints the
+confusion table.
+"""
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+ELASTIC = ("neo_hookean", {"youngs_modulus": 3e4, "poissons_ratio": 0.3})
+STIFF = ("neo_hookean", {"youngs_modulus": 8e4, "poissons_ratio": 0.3})
+PLASTIC = ("von_mises", {"youngs_modulus": 1e5, "poissons_ratio": 0.3, "yield_stress": 2e3})
+MATERIALS = {"elastic": ELASTIC, "stiff": STIFF, "plastic": PLASTIC}
+
+STRENGTHS = {
+    "linear_drag": [{"rate": 0.3}, {"rate": 0.8}],
+    "quadratic_drag": [{"coefficient": 0.15}, {"coefficient": 0.4}],
+    "body_force": [
+        {"acceleration_x": 0.6, "acceleration_y": 0.0, "acceleration_z": -0.4},
+        {"acceleration_x": -1.5, "acceleration_y": 0.0, "acceleration_z": 1.0},
+    ],
+    "gravity_scale": [{"relative_change": -0.1}, {"relative_change": 0.15}],
+    "ground_friction": [{"slipperiness": 5.0}, {"slipperiness": 20.0}],
+    "restitution": [{"coefficient": 0.4}, {"coefficient": 0.8}],
+    "ground_height": [{"height": 0.08}],
+    "viscosity": [{"viscosity": 30.0}, {"viscosity": 80.0}],
+    "stiffness_contrast": [{"log_stiffness_ratio": 1.5, "x": 0.05, "y": 0.55, "z": 0.0, "radius": 0.15}],
+    "hidden_obstacle": [{"radius": 0.12, "x": 0.45, "y": 0.12, "z": 0.1}],
+    "point_mass": [{"mass": 3.0, "x": 0.0, "y": 0.5, "z": -0.1}],
+    "periodic_force": [
+        {"cosine_x": 2.0, "cosine_y": 0.0, "cosine_z": 0.0, "sine_x": 0.0, "sine_y": 0.0, "sine_z": 2.0,
+         "frequency": 4.0}
+    ],
+    "swirl": [{"strength": 6.0, "x": 0.0, "z": 0.0}],
+    "time_offset": [{"delay": 0.02}, {"delay": -0.015}],
+}  # fmt: skip
+
+
+def cases():
+    """Every effect at its strengths in one material each in turn, and controls of every material."""
+    from track_cases import Case
+
+    out, turn = [], 0
+    for material, (law, parameters) in MATERIALS.items():
+        out.append(Case(f"control_{material}", law, parameters, {}, seed=len(out)))
+    for effect, strengths in STRENGTHS.items():
+        for k, values in enumerate(strengths):
+            for material in (
+                ("elastic", "plastic") if effect not in ("viscosity", "restitution") else ("elastic", "stiff")
+            ):
+                law, parameters = MATERIALS[material]
+                name = f"{effect}_{k}_{material}"
+                out.append(Case(name, law, parameters, {effect: values}, seed=len(out)))
+                turn += 1
+    law, parameters = ELASTIC
+    two = {"linear_drag": {"rate": 0.6}, "body_force": STRENGTHS["body_force"][1]}
+    out.append(Case("linear_drag+body_force", law, parameters, two, seed=len(out)))
+    two = {"linear_drag": {"rate": 0.6}, "viscosity": {"viscosity": 60.0}}
+    out.append(Case("linear_drag+viscosity", law, parameters, two, seed=len(out)))
+    return out
+
+
+def refined(case, particles, laws):
+    import torch
+    from track_cases import observed
+
+    from masiv.checkpoint import Checkpoint
+    from masiv.identify.config import IdentifyConfig
+    from masiv.mpm.config import SimulatorConfig
+    from masiv.refine.baselines import baselines
+    from masiv.refine.config import RefineConfig
+    from masiv.refine.loop import close_loop
+    from masiv.refine.model import Simulation
+    from masiv.refine.noise import noise_floor_mm
+    from masiv.refine.observed import SampledMotion
+    from masiv.refine.prepare import experiment_of
+
+    torch.set_num_threads(1)
+    scene, motion = observed(case)
+    config = RefineConfig.model_validate({"particles": particles, "laws": laws})
+    whole = SampledMotion(motion.positions, motion.times, motion.volume)
+    cut = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
+    experiment, few, launch = experiment_of(
+        "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config, seed=0
+    )
+    simulation = Simulation([experiment])
+    noise = noise_floor_mm(cut.positions, launch.last_frame)
+    began = time.time()
+    fits = baselines(simulation, few, min(launch.last_frame + 2, few.frames), config, Checkpoint(None), quiet)
+    middle = time.time()
+    outcome = close_loop(simulation, fits, noise, config, quiet)
+    first = outcome.rounds[0] if outcome.rounds else None
+    return {
+        "case": case.name,
+        "true": {k: v for k, v in case.effects.items()},
+        "laws": [f.model.family.kind for f in fits],
+        "noise_mm": noise,
+        "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
+        "trials": [
+            (t.fitted.model.family.kind, t.candidate.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.reasons)
+            for r in outcome.rounds for t in r.trials
+        ],
+        "accepted": list(outcome.after.model.effects),
+        "law": outcome.after.model.family.kind,
+        "values": outcome.after.values,
+        "stderr": outcome.after.stderr,
+        "confusable": first.confusable if first else {},
+        "before": [outcome.before.fit_mm, outcome.before.held_out_mm],
+        "after": [outcome.after.fit_mm, outcome.after.held_out_mm],
+        "oracle": oracle(simulation, case, outcome),
+        "seconds": [middle - began, time.time() - middle],
+    }  # fmt: skip
+
+
+def quiet(*_):
+    """No progress."""
+
+
+def oracle(simulation, case, outcome):
+    """Errors [mm] of a model of the true law that was told the true effects, values too, and fitted for the rest."""
+    from masiv.errors import MasivError
+    from masiv.identify.families import FAMILIES
+    from masiv.refine.model import Model, effect_parameters
+    from masiv.refine.refit import full_fit
+
+    model = Model(FAMILIES[case.law], case.contact, tuple(case.effects))
+    told = {p.name: case.effects[n][p.name.split(".")[1]] for n in case.effects for p in effect_parameters(n)}
+    own = {n: v for n, v in outcome.before.values.items() if "@" in n}
+    try:
+        fitted = full_fit(simulation, model, {**own, **case.parameters, **told}, budget=45)
+    except MasivError as failed:
+        return str(failed)
+    return [fitted.fit_mm, fitted.held_out_mm]
+
+
+def table(path):
+    rows = [json.loads(line) for line in Path(path).read_text().splitlines()]
+    right = second = 0
+    print("| case | accepted | first ranked | before fit / held out [mm] | after | oracle | s |")
+    print("|---|---|---|---|---|---|---|")
+    for r in rows:
+        true = set(r["true"])
+        right += set(r["accepted"]) == true
+        tried = [t[1] for t in r["trials"]]
+        second += set(r["accepted"]) == true or bool(true & set(tried[:2]))
+        show = [" / ".join(f"{v:.1f}" for v in r[k]) if isinstance(r[k], list) else "–"
+                for k in ("before", "after", "oracle")]  # fmt: skip
+        ranked = f"{r['ranked'][0][0]} {r['ranked'][0][1]}" if r["ranked"] else "–"
+        print(f"| {r['case']} | {', '.join(r['accepted']) or 'none'} | {ranked} | {show[0]} | {show[1]} | {show[2]} | "
+              f"{sum(r['seconds']):.0f} |")  # fmt: skip
+    print(f"\nexactly right: {right} of {len(rows)}; right, or among the two best refits: {second} of {len(rows)}")
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", default="refine_tracks.jsonl")
+    parser.add_argument("--only", default="")
+    parser.add_argument("--particles", type=int, default=1500)
+    parser.add_argument("--laws", default="", help="families that compete, with commas; all where empty")
+    parser.add_argument("--table")
+    options = parser.parse_args()
+    if options.table:
+        table(options.table)
+        return
+    from masiv import runtime
+
+    runtime.start("cpu")
+    out = Path(options.out)
+    done = {json.loads(line)["case"] for line in out.read_text().splitlines()} if out.exists() else set()
+    for case in cases():
+        if case.name in done or (options.only and options.only not in case.name):
+            continue
+        row = refined(case, options.particles, [n for n in options.laws.split(",") if n])
+        with out.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        print(case.name, "->", row["accepted"], [round(x) for x in row["seconds"]], flush=True)
+
+
+if __name__ == "__main__":
+    main()

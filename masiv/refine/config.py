@@ -1,0 +1,25 @@
+"""Settings of refine. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class RefineConfig(BaseModel):
+    """How hard to look for missing effects, and what is enough to accept one."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    particles: int = Field(1500, ge=100, description="particles of the rollouts")
+    samples_per_frame: int = Field(2, ge=1, le=16, description="instants per frame at which motions are compared")
+    families: int = Field(2, ge=1, description="classical laws that compete, the best by their fit without any effect")
+    laws: list[str] = Field([], description="families that compete; all where empty")
+    baseline_rollouts: int = Field(45, ge=2, description="rollouts of each stage of a law's fit without effects")
+    shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
+    max_effects: int = Field(3, ge=1, description="effects that may be added")
+    above_noise: float = Field(1.3, ge=1, description="residual over the noise floor below which nothing is looked for")
+    least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")
+    least_gain: float = Field(0.15, ge=0, le=1, description="share of the held-out error that an effect must remove")
+    least_bic: float = Field(10.0, ge=0, description="how far an effect must lower the information criterion")
+    least_sigmas: float = Field(4.0, ge=0, description="standard errors that a strength must lie from zero")
+    confusable: float = Field(0.95, gt=0, le=1, description="correlation from which two effects look alike")

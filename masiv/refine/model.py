@@ -1,0 +1,131 @@
+"""A model of one or several throws of a body, with few parameters: a classical law, effects, and each throw's start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from masiv.effects.active import ActiveEffects
+from masiv.effects.library import effect_named
+from masiv.errors import InputError, MasivError, NonFiniteError
+from masiv.identify.families import Family, law_of, motion_of, motion_parameters
+from masiv.identify.parametric import Parameter
+from masiv.identify.problem import Motion, Problem
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One throw: rollouts of the body against its observed motion, of which frames 1…fitted-1 may be fitted.
+
+    motion: of ``problem``'s start, simulation frame.
+    """
+
+    name: str
+    problem: Problem
+    fitted: int
+    motion: Motion
+
+    @property
+    def rows(self) -> int:
+        """Instants that may be fitted; those after are held out."""
+        return (self.fitted - 1) * self.problem.samples
+
+    @property
+    def holds_out(self) -> bool:
+        return self.fitted - 1 < self.problem.frames
+
+
+@dataclass(frozen=True)
+class Model:
+    """A law's family (parameters to fit), how the ground holds the body, and effects by name."""
+
+    family: Family
+    contact: str
+    effects: tuple[str, ...] = ()
+
+    def with_effect(self, name: str) -> Model:
+        return replace(self, effects=(*self.effects, name))
+
+
+def effect_parameters(name: str) -> tuple[Parameter, ...]:
+    """The parameters of an effect, named ``effect.parameter``."""
+    return tuple(
+        Parameter(f"{name}.{p.name}", float(np.clip(p.start, p.lower, p.upper)), p.lower, p.upper, p.step)
+        for p in effect_named(name).parameters
+    )
+
+
+def parameters(model: Model, experiments: Sequence[Experiment]) -> tuple[Parameter, ...]:
+    """What is fitted: law and effects, shared by all experiments, and each one's throw, named ``name@experiment``."""
+    own = [replace(p, name=f"{p.name}@{e.name}") for e in experiments for p in motion_parameters(e.problem, e.motion)]
+    return (*model.family.parameters, *own, *(p for name in model.effects for p in effect_parameters(name)))
+
+
+def throw_of(values: Mapping[str, float], experiment: Experiment) -> Motion:
+    """The throw of ``experiment`` among ``values``."""
+    suffix = f"@{experiment.name}"
+    return motion_of({n.removesuffix(suffix): v for n, v in values.items() if n.endswith(suffix)})
+
+
+def active(model: Model, values: Mapping[str, float], problem: Problem) -> ActiveEffects | None:
+    """The effects of ``model`` with their ``values``."""
+    if not model.effects:
+        return None
+    members = tuple(
+        (effect_named(n), torch.tensor([values[p.name] for p in effect_parameters(n)], dtype=torch.float32))
+        for n in model.effects
+    )
+    return ActiveEffects(members, problem.setting())
+
+
+class Simulation:
+    """Residuals of models. The number of substeps is that of the first law, as in ``masiv.identify.families``."""
+
+    STABLE = 1.4
+
+    def __init__(self, experiments: Sequence[Experiment]) -> None:
+        self.experiments = tuple(experiments)
+        self.steps = [0] * len(self.experiments)
+        self.rollouts = 0
+
+    @torch.no_grad()
+    def positions(self, model: Model, values: Mapping[str, float], index: int, frames: int) -> torch.Tensor:
+        """Positions (frames * samples, N, 3) [m, simulation frame] of experiment ``index``. Raises NonFiniteError."""
+        experiment = self.experiments[index]
+        problem = experiment.problem
+        law = law_of(model.family, dict(values))
+        try:
+            if self.steps[index] == 0:
+                self.steps[index] = problem.substeps(law)
+            needed = problem.least_substeps(law)
+            if needed > self.STABLE * self.steps[index]:
+                raise NonFiniteError(0, 0, f"the law needs {needed} substeps a frame, {self.steps[index]} are taken")
+            self.rollouts += 1
+            return problem.run(
+                law,
+                throw_of(values, experiment),
+                model.contact,
+                frames,
+                self.steps[index],
+                active(model, values, problem),
+            )
+        except (InputError, NonFiniteError):
+            raise
+        except MasivError as failed:
+            raise NonFiniteError(0, 0, str(failed)) from failed
+
+    def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
+        """Simulated less observed (K, N, 3) [m] of each experiment: its fitted instants, and the rest on request."""
+        out = []
+        for index, experiment in enumerate(self.experiments):
+            frames = experiment.problem.frames if held_out else experiment.fitted - 1
+            found = self.positions(model, values, index, frames)
+            out.append((found - experiment.problem.targets[: len(found)]).double().numpy())
+        return out
+
+    def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
+        """The fitted instants of all experiments, flat."""
+        return np.concatenate([f.ravel() for f in self.fields(model, values)])

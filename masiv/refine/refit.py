@@ -1,0 +1,201 @@
+"""Fit a model's parameters jointly: chord steps from known derivatives, then a full fit for standard errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from masiv.errors import NonFiniteError
+from masiv.identify.correlation import effective_samples
+from masiv.identify.parametric import FIRST_STEP, Parameter, covariance, fit_parameters, robust_weight
+from masiv.refine.model import Experiment, Model, Simulation, parameters
+
+LEAST_GAIN = 1e-3
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model with its parameters. residual (M,) [m] of the fitted instants; jacobian (M, P), per fitted scale.
+
+    cost [m^2]: robust mean square; samples: independent residuals. fit_mm and held_out_mm: root mean square distance;
+    held_out_mm is None where nothing is held out. stderr: of each of the values.
+    """
+
+    model: Model
+    values: dict[str, float]
+    parameters: tuple[Parameter, ...]
+    residual: np.ndarray
+    jacobian: np.ndarray
+    cost: float
+    samples: int
+    fit_mm: float
+    held_out_mm: float | None
+    stderr: dict[str, float]
+
+    def bic(self, samples: int) -> float:
+        """Bayesian information criterion of ``samples`` independent residuals. Compare models at one number of samples:
+        that of the best, since what a model lacks is smooth and makes residuals look fewer than they are."""
+        return samples * math.log(max(self.cost, 1e-300)) + len(self.parameters) * math.log(samples)
+
+
+def softness(residual: np.ndarray) -> float:
+    """Size [m] from which a residual counts as wild."""
+    return max(2 * 1.4826 * float(np.median(np.abs(residual))), 1e-9)
+
+
+def robust_cost(residual: np.ndarray, soft: float) -> float:
+    """Mean of 2 s^2 (sqrt(1 + r^2 / s^2) - 1) [m^2]."""
+    return float((2 * soft**2 * (np.sqrt(1 + (residual / soft) ** 2) - 1)).mean())
+
+
+def rms_mm(fields: Sequence[np.ndarray]) -> float:
+    """Root mean square distance of residual fields (K, N, 3) [m], in mm."""
+    squares = np.concatenate([(f**2).sum(2).ravel() for f in fields])
+    return 1e3 * float(np.sqrt(squares.mean()))
+
+
+def split(fields: Sequence[np.ndarray], experiments: Sequence[Experiment]) -> tuple[list, list]:
+    """Fitted and held-out instants of fields over all frames."""
+    fit = [f[: e.rows] for f, e in zip(fields, experiments, strict=True)]
+    return fit, [f[e.rows :] for f, e in zip(fields, experiments, strict=True) if e.holds_out]
+
+
+def moved(params: Sequence[Parameter], values: Mapping[str, float], step: np.ndarray) -> dict[str, float]:
+    """``values`` after a step in the fitted scales, no longer than a linear model deserves, within the bounds."""
+    out = dict(values)
+    for p, delta in zip(params, step, strict=True):
+        limit = FIRST_STEP * p.step
+        out[p.name] = p.value(p.fitted(values[p.name]) + float(np.clip(delta, -limit, limit)))
+    return out
+
+
+def column(
+    simulation: Simulation, model: Model, values: Mapping[str, float], residual: np.ndarray, p: Parameter
+) -> np.ndarray:
+    """Derivative (M,) of the residual with respect to ``p``, by a finite difference into the bounds."""
+    here = p.fitted(values[p.name])
+    sides = [1.0, -1.0] if here + p.step <= p.fitted(p.upper) else [-1.0, 1.0]
+    for side in sides:
+        nudged = {**values, p.name: p.value(here + side * p.step)}
+        actual = p.fitted(nudged[p.name]) - here
+        if actual == 0:
+            continue
+        try:
+            return (simulation.residual(model, nudged) - residual) / actual
+        except NonFiniteError:
+            continue
+    return np.zeros_like(residual)
+
+
+def chord_fit(
+    simulation: Simulation,
+    model: Model,
+    params: Sequence[Parameter],
+    values: Mapping[str, float],
+    residual: np.ndarray,
+    jacobian: np.ndarray,
+    *,
+    steps: int,
+    soft: float,
+) -> tuple[dict[str, float], np.ndarray, np.ndarray]:
+    """Damped Gauss-Newton with Broyden's update of a known Jacobian: one rollout a step.
+
+    Returns values, residual and the updated Jacobian.
+    """
+    values, jacobian = dict(values), jacobian.copy()
+    scale = np.array([p.step for p in params])
+    damping = 1e-3
+    cost = robust_cost(residual, soft)
+    for _ in range(steps):
+        weight = robust_weight(residual, soft)
+        a = (jacobian * scale) * weight[:, None]
+        normal, right = a.T @ a, a.T @ (-residual * weight)
+        free = _free(params, values, right)
+        step = np.zeros(len(params))
+        inner = normal[np.ix_(free, free)]
+        step[free] = np.linalg.lstsq(inner + damping * np.diag(np.diag(inner)), right[free], rcond=1e-10)[0]
+        trial = moved(params, values, step * scale)
+        actual = np.array([p.fitted(trial[p.name]) - p.fitted(values[p.name]) for p in params])
+        if not np.any(actual):
+            break
+        try:
+            found = simulation.residual(model, trial)
+        except NonFiniteError:
+            damping = max(10 * damping, 0.1)
+            continue
+        length = actual / scale
+        jacobian += np.outer(found - residual - jacobian @ actual, length / scale) / (length @ length)
+        gained = cost - robust_cost(found, soft)
+        if gained > 0:
+            done = gained < LEAST_GAIN * cost
+            values, residual, cost = trial, found, cost - gained
+            damping = max(damping / 5, 1e-6)
+            if done:
+                break
+        else:
+            damping = min(max(20 * damping, 0.05), 1e6)
+    return values, residual, jacobian
+
+
+def _free(params: Sequence[Parameter], values: Mapping[str, float], downhill: np.ndarray) -> np.ndarray:
+    """Indices of parameters that are not held at a bound which the descent would cross."""
+    out = []
+    for k, p in enumerate(params):
+        here = values[p.name]
+        if not ((here <= p.lower and downhill[k] < 0) or (here >= p.upper and downhill[k] > 0)):
+            out.append(k)
+    return np.array(out, dtype=int)
+
+
+def summarised(
+    simulation: Simulation,
+    model: Model,
+    params: Sequence[Parameter],
+    values: Mapping[str, float],
+    jacobian: np.ndarray,
+    *,
+    soft: float,
+) -> Fitted:
+    """``Fitted`` of given values: one rollout over all frames; standard errors from ``jacobian``."""
+    fields = simulation.fields(model, values, held_out=True)
+    fit, rest = split(fields, simulation.experiments)
+    residual = np.concatenate([f.ravel() for f in fit])
+    samples = sum(
+        effective_samples(f, e.problem.start.double().numpy()) for f, e in zip(fit, simulation.experiments, strict=True)
+    )
+    weight = robust_weight(residual, soft)
+    spread = np.diag(covariance(jacobian * weight[:, None], residual * weight))
+    inflation = max(len(residual) - len(params), 1) / max(samples - len(params), 1)
+    stderr = {
+        p.name: float(math.sqrt(v * inflation) * (abs(values[p.name]) if p.log else 1.0))
+        if math.isfinite(v)
+        else math.inf
+        for p, v in zip(params, spread, strict=True)
+    }
+    return Fitted(
+        model, dict(values), tuple(params), residual, jacobian, robust_cost(residual, soft), samples,
+        rms_mm(fit), rms_mm(rest) if rest else None, stderr,
+    )  # fmt: skip
+
+
+def full_fit(
+    simulation: Simulation, model: Model, values: Mapping[str, float], *, budget: int, soft: float | None = None
+) -> Fitted:
+    """Gauss-Newton with fresh derivatives from ``values`` (defaults where missing), and standard errors."""
+    params = started(parameters(model, simulation.experiments), values)
+    estimate = fit_parameters(
+        lambda v: simulation.residual(model, v), params, max_evaluations=budget, robust=True, tolerance=LEAST_GAIN
+    )
+    return summarised(
+        simulation, model, params, estimate.values, estimate.jacobian, soft=soft or softness(estimate.residual)
+    )
+
+
+def started(params: Sequence[Parameter], values: Mapping[str, float]) -> tuple[Parameter, ...]:
+    """Parameters that start at ``values``, where they are given, within their bounds."""
+    from dataclasses import replace
+
+    return tuple(replace(p, start=float(np.clip(values.get(p.name, p.start), p.lower, p.upper))) for p in params)

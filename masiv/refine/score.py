@@ -1,0 +1,127 @@
+"""Which effects could explain a residual: a score test at zero strength, nuisances projected out.
+
+For each effect the sensitivity S = d residual / d strength comes from one more rollout a strength. What velocity, spin,
+ground and law could have absorbed is projected out of residual and sensitivity; what then remains of the residual along
+S is the explained share, the least-squares coefficient the strength (Rao's score or Lagrange-multiplier test).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from masiv.effects.effect import Effect
+from masiv.effects.library import effects
+from masiv.errors import NonFiniteError
+from masiv.identify.parametric import robust_weight
+from masiv.refine.model import Simulation, effect_parameters
+from masiv.refine.refit import Fitted
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect as the ranking sees it. explained: share of the residual, 0…1. theta: all its parameters; columns
+    (M, strengths): sensitivities at ``theta``'s places; pattern (M,): what it explains, unit length, weighted."""
+
+    effect: str
+    explained: float
+    theta: dict[str, float]
+    stderr: dict[str, float]
+    columns: np.ndarray
+    pattern: np.ndarray
+
+
+def score(
+    simulation: Simulation,
+    base: Fitted,
+    *,
+    soft: float,
+    names: list[str] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> list[Candidate]:
+    """Every effect that ``base`` lacks, best explained first. names: only these."""
+    weight = robust_weight(base.residual, soft)
+    nuisance = _basis(base.jacobian * weight[:, None])
+    left = _without(nuisance, base.residual * weight)
+    library = effects()
+    setting = simulation.experiments[0].problem.setting()
+    on_ground = any(library[n].on_grid == "ground" for n in base.model.effects)
+    found = []
+    todo = [n for n in (names or library) if n not in base.model.effects]
+    for done, name in enumerate(todo):
+        if progress is not None:
+            progress(name, done, len(todo))
+        effect = library[name]
+        if effect.on_grid == "ground" and (on_ground or base.model.contact == "none"):
+            continue
+        tried = [_tried(simulation, base, effect, guess, weight, nuisance, left) for guess in effect.guesses(setting)]
+        known = [t for t in tried if t is not None]
+        if known:
+            found.append(max(known, key=lambda c: c.explained))
+    return sorted(found, key=lambda c: -c.explained)
+
+
+def _tried(
+    simulation: Simulation, base: Fitted, effect: Effect, guess: tuple[float, ...], weight: np.ndarray,
+    nuisance: np.ndarray, left: np.ndarray,
+) -> Candidate | None:  # fmt: skip
+    """The effect with its places, frequencies… at ``guess``; None where its rollouts diverge."""
+    model = base.model.with_effect(effect.name)
+    params = effect_parameters(effect.name)
+    strengths, others = params[: effect.strengths], params[effect.strengths :]
+    fixed = {p.name: value for p, value in zip(others, guess, strict=True)}
+    absent = {**base.values, **{p.name: 0.0 for p in strengths}, **fixed}
+    columns = []
+    try:
+        for p in strengths:
+            columns.append((simulation.residual(model, {**absent, p.name: p.step}) - base.residual) / p.step)
+    except NonFiniteError:
+        return None
+    s = np.stack(columns, axis=1)
+    s_left = _without(nuisance, s * weight[:, None])
+    theta, pattern = _within_bounds(s_left, left, strengths)
+    total = float(left @ left)
+    explained = 1 - float((left + pattern) @ (left + pattern)) / max(total, 1e-300)
+    length = float(np.linalg.norm(pattern))
+    per_sample = total / max(base.samples - len(base.parameters) - len(strengths), 1)
+    share = len(left) / max(base.samples, 1)
+    spread = np.linalg.pinv(s_left.T @ s_left) * per_sample * share * base.samples / len(left)
+    return Candidate(
+        effect.name,
+        max(explained, 0.0),
+        {**{p.name: float(t) for p, t in zip(strengths, theta, strict=True)}, **fixed},
+        {p.name: float(np.sqrt(max(v, 0.0))) for p, v in zip(strengths, np.diag(spread), strict=True)},
+        s,
+        pattern / length if length > 0 else pattern,
+    )
+
+
+def _within_bounds(s: np.ndarray, left: np.ndarray, strengths) -> tuple[np.ndarray, np.ndarray]:
+    """Strengths (S,) that make left + s theta least, none of an impossible sign; and s theta."""
+    from scipy.optimize import lsq_linear
+
+    scale = np.array([p.step for p in strengths])
+    lower = np.array([p.lower for p in strengths]) / scale
+    upper = np.array([p.upper for p in strengths]) / scale
+    # The normal equations are small and well scaled in units of steps.
+    q, r = np.linalg.qr(s * scale)
+    theta = lsq_linear(r, -(q.T @ left), (lower, upper)).x * scale
+    return theta, s @ theta
+
+
+def _basis(a: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span those of ``a`` (M, P)."""
+    lengths = np.linalg.norm(a, axis=0)
+    u, s, _ = np.linalg.svd(a[:, lengths > 0] / lengths[lengths > 0], full_matrices=False)
+    return u[:, s > 1e-6 * s[0]] if len(s) else u
+
+
+def _without(basis: np.ndarray, a: np.ndarray) -> np.ndarray:
+    return a - basis @ (basis.T @ a)
+
+
+def alike(a: Candidate, b: Candidate) -> float:
+    """|correlation| of what two effects explain."""
+    return abs(float(a.pattern @ b.pattern))
