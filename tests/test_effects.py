@@ -83,7 +83,7 @@ def test_gradient_by_finite_differences(name, contact):
     with torch.no_grad():
         for i, parameter in enumerate(effect.parameters):
             step = torch.zeros_like(theta)
-            step[i] = 1e-3 * parameter.step
+            step[i] = 1e-4 * parameter.step  # few nodes begin or cease to slip within it
             slope = (loss(theta + step) - loss(theta - step)) / (2 * step[i])
             expected = pytest.approx(slope.item(), rel=2e-4, abs=1e-7 / parameter.step)
             assert theta.grad[i].item() == expected, parameter.name

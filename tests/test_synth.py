@@ -11,7 +11,7 @@ from ring_scene import look_at, pixel_rays
 
 from masiv.errors import InputError
 from masiv.scene.read import read_scene
-from masiv.synth.motion import Skin
+from masiv.synth.motion import Skin, simulate
 from masiv.synth.picture import rasterise
 from masiv.synth.shapes import make_body
 from masiv.synth.spec import ShapeSpec, SynthSpec, read_spec
@@ -70,6 +70,48 @@ def test_free_fall_of_the_truth(scene_folder):
         a, b = points[0] - points[0].mean(0), points[frame] - points[frame].mean(0)
         turn = np.arctan2((a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]).sum(), (a[:, [0, 2]] * b[:, [0, 2]]).sum())
         assert turn == pytest.approx(3.0 * t, rel=0.1)
+
+
+def test_undeclared_drag_is_simulated_and_only_the_truth_tells(scene_folder, taichi, tmp_path):
+    drag = {"linear_drag": {"rate": 4.0}}
+    synthesise(SynthSpec.model_validate({**SMALL, "truth_particles": 4096, "effects": drag}), tmp_path / "scene")
+    first, last = (np.load(tmp_path / "scene" / "gt" / f"particles_{k}.npy").astype(float) for k in (0, 2))
+    assert (last - first).mean(0)[0] == pytest.approx(0.5 * (1 - np.exp(-4 / 12)) / 4, rel=0.02)  # 0.042 without drag
+    assert yaml.safe_load((tmp_path / "scene" / "truth.yaml").read_text())["effects"] == drag
+    assert yaml.safe_load((scene_folder / "truth.yaml").read_text())["effects"] == {}
+    texts = [p for p in (tmp_path / "scene").rglob("*") if p.suffix in (".json", ".yaml") and p.name != "truth.yaml"]
+    assert texts
+    assert not any("drag" in p.read_text() for p in texts)
+
+
+def test_ground_and_clock_of_a_spec_are_off(taichi):
+    late = {**SMALL, "frames": 4, "effects": {"time_offset": {"delay": 0.011}}}
+    spec = SynthSpec.model_validate(late)
+    body = make_body(spec.shape, spec.particles)
+    fall = simulate(spec, body).mean(1)[:, 1]
+    t = np.arange(1, 4) / 24 + 0.011
+    np.testing.assert_allclose(fall[1:] - fall[0], 0.2 * t - 4.9 * t * t, atol=3e-3)
+    assert fall[0] == pytest.approx(body.particles[:, 1].mean(), abs=1e-6)
+    raised = {**SMALL, "velocity": [0, -3.0, 0], "frames": 6, "effects": {"ground_height": {"height": 0.1}}}
+    low, high = (simulate(SynthSpec.model_validate(s), body) for s in ({**raised, "effects": {}}, raised))
+    assert high[:, :, 1].min() > low[:, :, 1].min() + 0.05
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"drag": {"rate": 1.0}}, "unknown effect 'drag'"),
+        ({"linear_drag": {"strength": 1.0}}, r"effects\.linear_drag\.strength"),
+        ({"linear_drag": {"rate": -1.0}}, "outside"),
+        ({"linear_drag": {}}, "lacks rate"),
+        ({"point_mass": {"mass": 1.0, "x": 0.0}}, "lacks y, z"),
+        ({"time_offset": {"delay": -0.09}}, "before the start"),
+    ],
+)
+def test_unusable_effect(taichi, given, message):
+    spec = SynthSpec.model_validate({**SMALL, "effects": given})
+    with pytest.raises(InputError, match=message):
+        simulate(spec, make_body(spec.shape, spec.particles))
 
 
 def test_same_seed_same_files_and_no_overwriting(scene_folder, tmp_path):

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from masiv.errors import InputError
 from masiv.synth.shapes import Body
 from masiv.synth.spec import SynthSpec
+
+if TYPE_CHECKING:
+    from masiv.effects.active import ActiveEffects
 
 _PARTICLES_PER_CELL = 8
 _COURANT = 0.25
@@ -18,7 +23,8 @@ _NEIGHBOURS = 16
 def simulate(spec: SynthSpec, body: Body) -> np.ndarray:
     """Positions (T, N, 3) float32 [m] of the body's particles at every frame.
 
-    Needs ``masiv.runtime.start``. Raises InputError for an unusable law, NonFiniteError where the simulation blows up.
+    Frame 0 is the start, whatever effects say of the clock. Needs ``masiv.runtime.start``. Raises InputError for an
+    unusable law or effect, NonFiniteError where the simulation blows up.
     """
     import torch
 
@@ -45,14 +51,59 @@ def simulate(spec: SynthSpec, body: Body) -> np.ndarray:
         grid_nodes=1 << 20,
     )
     position = torch.as_tensor(body.particles, dtype=torch.float32)
+    effects = _effects(spec, position, body.volume)
+    raised = torch.tensor([0.0, float(effects.ground_shift()), 0.0])
     omega = torch.tensor(spec.omega, dtype=torch.float32)
     velocity = torch.tensor(spec.velocity) + torch.linalg.cross(omega.expand_as(position), position - position.mean(0))
     x, y, z = spec.omega
     spin = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float32)
-    start = at_rest(position, velocity.float(), spin.expand(count, 3, 3))
-    steps = per_frame * (spec.frames - 1)
-    recording = simulator.run(start, law, steps, [k * per_frame for k in range(spec.frames)])
-    return recording.positions.numpy()
+    start = at_rest(position - raised, velocity.float(), spin.expand(count, 3, 3))
+    # Instants of the frames in substeps; between two of these a particle moves in a straight line.
+    instants = per_frame * (np.arange(1, spec.frames) + float(effects.time_shift()) * spec.fps)
+    if instants[0] < 0:
+        raise InputError(f"effects.time_offset puts frame 1 before the start: give more than {-1 / spec.fps:g} s")
+    before = np.floor(instants).astype(int)
+    share = torch.as_tensor(instants - before, dtype=torch.float32)[:, None, None]
+    wanted = np.unique(np.concatenate([before, before + (instants > before)]))
+    recording = simulator.run(start, law, int(wanted[-1]), wanted.tolist(), effects)
+    at = recording.positions
+    early = at[np.searchsorted(wanted, before)]
+    late = at[np.searchsorted(wanted, before + (instants > before))]
+    return torch.cat([position[None], torch.lerp(early, late, share) + raised]).numpy()
+
+
+def _effects(spec: SynthSpec, rest, volume: float) -> ActiveEffects:
+    """The effects of the spec for a body with particles ``rest`` (N, 3). Raises InputError for one that is unknown or
+    lacks a place, a frequency…; strengths that are not given are zero."""
+    import torch
+
+    from masiv.effects.active import ActiveEffects
+    from masiv.effects.effect import Setting
+    from masiv.effects.library import effect_named
+
+    members = []
+    for name, given in spec.effects.items():
+        effect = effect_named(name)
+        known = [p.name for p in effect.parameters]
+        for parameter in given:
+            if parameter not in known:
+                raise InputError(f"effects.{name}.{parameter}: {name} has no such parameter, use {', '.join(known)}")
+        missing = [n for n in known[effect.strengths :] if n not in given]
+        if missing or not given:
+            raise InputError(f"effects.{name} lacks {', '.join(missing or known)}: give it a value")
+        for p in effect.parameters:
+            if p.name in given and not p.lower <= given[p.name] <= p.upper:
+                raise InputError(f"effects.{name}.{p.name} is outside of {p.lower:g} to {p.upper:g} {p.unit}")
+        members.append((effect, torch.tensor([given.get(n, 0.0) for n in known])))
+    setting = Setting(
+        gravity=torch.tensor(spec.gravity),
+        rest=rest,
+        particle_mass=spec.material.density * volume / len(rest),
+        size=float((rest.amax(0) - rest.amin(0)).max()),
+        duration=(spec.frames - 1) / spec.fps,
+        frame_time=1 / spec.fps,
+    )
+    return ActiveEffects(tuple(members), setting)
 
 
 class Skin:

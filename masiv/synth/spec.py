@@ -63,6 +63,9 @@ class SynthSpec(_Part):
     gravity: Vector = Field((0, -9.8, 0), description="[m/s^2]")
     contact: Literal["sticky", "release", "slip"] = "sticky"
     friction: float = Field(0.0, ge=0, description="Coulomb's coefficient of contact slip")
+    effects: dict[str, dict[str, float]] = Field(
+        {}, description="of masiv.effects, by name, with their parameters: simulated, but told only in truth.yaml"
+    )
     frames: int = Field(12, ge=2)
     fps: float = Field(24.0, gt=0)
     cameras: CameraSpec = CameraSpec()

@@ -25,7 +25,8 @@ _SMALL = [cv2.IMWRITE_PNG_COMPRESSION, 9]
 def synthesise(spec: SynthSpec, out: Path, *, progress: Progress = silent) -> None:
     """Simulate and film ``spec`` into the new folder ``out``, complete or not at all. Needs ``masiv.runtime.start``.
 
-    Raises InputError where ``out`` holds something already, or for an unusable mesh or law.
+    The spec is in ``truth.yaml``, with its undeclared effects, of which nothing else in ``out`` tells. Raises
+    InputError where ``out`` holds something already, or for an unusable mesh, law or effect.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} holds something already: give --out a new folder")

@@ -1,0 +1,200 @@
+"""Each effect in a case whose answer is known on paper. A uniform motion in free flight is exact in MPM."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_effects import DT, F64, LAW, body, setting, simulator
+
+from masiv.effects.active import ActiveEffects
+from masiv.effects.library import effects
+from masiv.materials.classical import ClassicalLaw
+from masiv.mpm.rollout import at_rest, rollout
+from masiv.mpm.simulate import thrown
+
+WEIGHTLESS = (0.0, 0.0, 0.0)
+G = 9.8
+
+
+def run(name, theta, steps, *, x=None, velocity=(0, 0, 0), omega=(0, 0, 0), outputs=None, law=LAW, state=None, **kind):
+    """Positions (K, N, 3) at the substeps ``outputs``, the last two by default, of a body far above ground."""
+    x = body(height=5.0) if x is None else x
+    state = thrown(x, torch.tensor(velocity, dtype=F64), torch.tensor(omega, dtype=F64)) if state is None else state
+    active = None
+    if name is not None:
+        active = ActiveEffects(((effects()[name], torch.tensor(theta, dtype=F64)),), setting(x))
+    return rollout(simulator(len(x), **kind), law, state, steps, outputs or [steps - 1, steps], active)
+
+
+@pytest.fixture(autouse=True)
+def _no_gradients():
+    with torch.no_grad():
+        yield
+
+
+def last_velocity(positions):
+    """Mean (3,) over the particles in the last substep."""
+    return ((positions[-1] - positions[-2]) / DT).mean(0).numpy()
+
+
+def test_linear_drag_decays_exponentially():
+    v = last_velocity(run("linear_drag", [3.0], 100, velocity=(2.0, 0, 1.0), gravity=WEIGHTLESS))
+    np.testing.assert_allclose(v, np.array([2.0, 0, 1.0]) * math.exp(-0.3), atol=1e-9)
+
+
+def test_quadratic_drag_decays_as_one_over_time_and_has_a_terminal_velocity():
+    v = last_velocity(run("quadratic_drag", [3.0], 100, velocity=(2.0, 0, 1.5), gravity=WEIGHTLESS))
+    np.testing.assert_allclose(v, np.array([2.0, 0, 1.5]) / (1 + 3.0 * 2.5 * 0.1), atol=1e-9)
+    fall = last_velocity(run("quadratic_drag", [5.0], 300))
+    assert fall[1] == pytest.approx(-math.sqrt(G / 5.0) * math.tanh(0.3 * math.sqrt(5.0 * G)), rel=5e-3)
+
+
+def test_gravity_scale_and_body_force_add_to_gravity():
+    fall = last_velocity(run("gravity_scale", [-0.25], 80))
+    np.testing.assert_allclose(fall, [0, -0.75 * G * 0.08, 0], atol=1e-9)
+    pushed = last_velocity(run("body_force", [1.0, 2.0, -3.0], 80))
+    np.testing.assert_allclose(pushed, [0.08, (2.0 - G) * 0.08, -0.24], atol=1e-9)
+
+
+def test_periodic_force_gives_the_impulse_of_its_integral():
+    a, b, omega, t = np.array([5.0, 0, 1.0]), np.array([0, 4.0, -2.0]), 2 * math.pi * 3.0, 0.13
+    v = last_velocity(run("periodic_force", [*a, *b, 3.0], 130, gravity=WEIGHTLESS))
+    np.testing.assert_allclose(v, a * math.sin(omega * t) / omega + b * (1 - math.cos(omega * t)) / omega, atol=1e-4)
+
+
+def test_swirl_spins_up_and_carries_round():
+    x = body(height=5.0)
+    middle, axis = x.mean(0), x.mean(0) + torch.tensor([0.4, 0.0, 0.0], dtype=F64)
+    positions = run("swirl", [6.0, axis[0].item(), axis[2].item()], 60, x=x, gravity=WEIGHTLESS)
+    v, t = (positions[-1] - positions[-2]) / DT, 0.06
+    # up x (x - c), with x - c = (-0.4, 0, 0), is (0, 0, 0.4)
+    np.testing.assert_allclose(v.mean(0).numpy(), [0, 0, 6.0 * 0.4 * t], atol=2e-3)
+    arm = x - middle
+    momentum = (arm[:, 2] * v[:, 0] - arm[:, 0] * v[:, 2]).sum()
+    assert (momentum / (arm[:, 0] ** 2 + arm[:, 2] ** 2).sum()).item() == pytest.approx(6.0 * t, rel=0.02)
+
+
+def test_viscosity_damps_an_oscillation_at_the_rate_of_kelvin_and_voigt():
+    """A mode that keeps volume has the complex shear modulus mu + i omega eta: it decays at omega^2 eta / (2 mu)."""
+    x, mu, eta = body(height=5.0), 2e4 / 2 / 1.3, 12.0
+    stretch = torch.diag(torch.tensor([1.0, -0.5, -0.5], dtype=F64)) * 0.5
+    state = at_rest(x, (x - x.mean(0)) @ stretch.T, stretch.expand(len(x), 3, 3))
+    outputs, arm = list(range(0, 241, 2)), (x - x.mean(0))[:, 0]
+    free, damped = (
+        (run(name, [eta], 240, x=x, state=state, gravity=WEIGHTLESS, outputs=outputs, law=LAW)[:, :, 0] * arm).sum(1)
+        for name in (None, "viscosity")
+    )
+    free, damped = (q - q[0] for q in (free, damped))
+    # the first extremum each way: half a period apart, and the ratio of the swings is the decay between them
+    first, second = int(free[:60].argmax()), int(free.argmin())
+    half_period = (second - first) * 2 * DT
+    swing = [(q.max() - q.min()).item() for q in (free, damped)]
+    omega = math.pi / half_period
+    expected = omega**2 * eta / (2 * mu) * 0.5 * (first + second) * 2 * DT
+    assert math.log(swing[0] / swing[1]) == pytest.approx(expected, rel=0.2)
+
+
+def test_stiffness_contrast_everywhere_is_a_stiffer_law():
+    x = body()
+    kind = {"x": x, "velocity": (0.5, -2.0, 0.0)}
+    stiffer = ClassicalLaw("neo_hookean", youngs_modulus=2e4 * math.exp(0.7), poissons_ratio=0.3)
+    everywhere = run("stiffness_contrast", [0.7, *x.mean(0).tolist(), 1e4], 80, **kind)
+    torch.testing.assert_close(everywhere, run(None, None, 80, law=stiffer, **kind), rtol=0, atol=1e-9)
+    # in one corner: the squeeze differs there, not in the opposite one
+    low = x.min(0).values
+    low[1] = x[:, 1].max()
+    corner = run("stiffness_contrast", [0.7, *low.tolist(), 0.03], 80, **kind)
+    changed = (corner[-1] - run(None, None, 80, **kind)[-1]).norm(dim=1)
+    near = (x - low).norm(dim=1) < 0.08
+    assert changed[near].mean() > 2 * changed[~near].mean()
+
+
+def test_point_mass_adds_what_it_says_and_moves_the_centre_of_mass():
+    x = body(height=5.0)
+    place, omega = torch.tensor([0.2, 5.1, 0.1], dtype=F64), torch.tensor([0, 0, 4.0], dtype=F64)
+    theta = torch.tensor([3.0, *place], dtype=F64)
+    effect, known = effects()["point_mass"], setting(x)
+    mass = known.particle_mass * effect.mass_factor(theta, known)
+    assert mass.sum().item() == pytest.approx(8.0 + 3.0, abs=1e-9)
+    outside = effect.mass_factor(torch.tensor([3.0, 50.0, 0, 0], dtype=F64), known)
+    assert known.particle_mass * outside.sum().item() == pytest.approx(11.0, abs=1e-9)
+    # No force acts: the centre of mass, and no other point, keeps the velocity that it was thrown with.
+    share = (mass / mass.sum())[:, None]
+    centre = (share * x).sum(0)
+    positions = run("point_mass", theta.tolist(), 60, x=x, omega=omega.tolist(), gravity=WEIGHTLESS)
+    expected = torch.linalg.cross(omega, centre - x.mean(0)) * 60 * DT
+    assert expected.norm() > 3e-3
+    torch.testing.assert_close((share * positions[-1]).sum(0) - centre, expected, rtol=0, atol=1e-9)
+
+
+def test_hidden_obstacle_stops_a_body_at_its_surface():
+    x = body(height=5.0)
+    centre, radius = torch.tensor([0.1, 4.65, 0.1], dtype=F64), 0.3
+    kind = {"x": x, "velocity": (0, -1.5, 0), "gravity": WEIGHTLESS}
+    through = run(None, None, 250, **kind)[-1]
+    assert ((through - centre).norm(dim=1) < radius).float().mean() > 0.9
+    stopped = run("hidden_obstacle", [radius, *centre.tolist()], 250, **kind, outputs=list(range(0, 251, 10)))
+    distance = (stopped - centre).norm(dim=2)
+    assert distance.min() > radius - 0.05  # a cell
+    assert distance[:, x[:, 1].argmin()].min() < radius + 0.05
+    assert (stopped[-1] - stopped[-2]).mean(0)[1] > 0  # and it bounces
+
+
+@pytest.mark.parametrize("slipperiness", [3.0, 5.0])
+def test_ground_friction_is_coulombs(slipperiness):
+    """While it slides, the ground takes mu times as much sideways as it gives upwards, until it stops."""
+    mu, v, x = 1 / slipperiness, 0.8, body(height=0.0)
+    outputs = [*range(59, 601, 60), *range(60, 601, 60)]
+    stiff = ClassicalLaw("neo_hookean", youngs_modulus=2e5, poissons_ratio=0.3)
+    positions = run("ground_friction", [slipperiness], 600, x=x, velocity=(v, 0, 0), contact="release", law=stiff,
+                    outputs=sorted(outputs))  # fmt: skip
+    speed = ((positions[1::2] - positions[::2]) / DT).mean(1)
+    sideways = v - speed[0, 0].item()
+    upwards = speed[0, 1].item() + G * 60 * DT
+    assert sideways / upwards == pytest.approx(mu, rel=0.02)
+    slid = (positions[-1] - x).mean(0)[0].item()
+    assert slid == pytest.approx(v * v / (2 * mu * G), rel=0.03)
+
+
+def test_ground_friction_agrees_with_the_simulators_slip():
+    kind = {"x": body(), "velocity": (1.0, -2.0, 0.5), "omega": (2.0, 1.0, -3.0)}
+    slip = run(None, None, 150, contact="slip", friction=0.3, **kind)
+    effect = run("ground_friction", [1 / 0.3], 150, contact="release", **kind)
+    torch.testing.assert_close(effect, slip, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("e", [0.3, 0.8])
+def test_restitution_bounces_to_e_squared_of_the_height(e):
+    """Loose matter, all of it at the ground: thrown back at e v, it climbs to e^2 of the height that it fell from."""
+    x, v, steps = body(height=-0.3), 2.0, 170
+    dust = ClassicalLaw("neo_hookean", youngs_modulus=1e-3, poissons_ratio=0.3)
+    height = run("restitution", [e], steps, x=x, velocity=(0, -v, 0), law=dust, contact="release",
+                 outputs=list(range(1, steps + 1)))[:, :, 1].mean(1)  # fmt: skip
+    first = (height[0] - x[:, 1].mean()).item() / DT
+    assert first == pytest.approx(e * (v + G * DT), rel=1e-9)
+    climbed = (height.max() - height[0]).item()
+    assert climbed == pytest.approx(e * e * v * v / (2 * G), rel=0.03)
+
+
+def test_restitution_frees_what_sticky_ground_keeps():
+    """e = 1 on sticky ground: a body thrown down leaves the ground again, which otherwise keeps it."""
+    kind = {"x": body(), "velocity": (0, -2.0, 0), "contact": "sticky"}
+    kept, freed = (run("restitution", [e], 200, **kind)[-1][:, 1] for e in (0.0, 1.0))
+    assert kept.min() < 0.03
+    assert freed.min() > 0.1
+
+
+@torch.enable_grad()
+def test_ground_height_and_time_offset_hand_their_shift_to_the_caller():
+    x = body()
+    thetas = [("ground_height", 0.02), ("time_offset", -0.004), ("linear_drag", 1.0)]
+    active = ActiveEffects(
+        tuple((effects()[n], torch.tensor([v], dtype=F64, requires_grad=True)) for n, v in thetas), setting(x)
+    )
+    assert active.ground_shift().item() == pytest.approx(0.02)
+    assert active.time_shift().item() == pytest.approx(-0.004)
+    (active.ground_shift() + 2 * active.time_shift()).backward()
+    assert [theta.grad.item() if theta.grad is not None else None for _, theta in active.members] == [1.0, 2.0, None]
