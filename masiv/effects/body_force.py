@@ -15,7 +15,7 @@ class BodyForce(Effect):
 
     name = "body_force"
     looks_like = "the whole body drifts off its parabola, faster and faster, always the same way"
-    parameters = tuple(EffectParameter(f"acceleration_{axis}", "m/s^2", -20.0, 20.0, 0.01) for axis in "xyz")
+    parameters = tuple(EffectParameter(f"acceleration_{axis}", "m/s^2", -20.0, 20.0, 0.05) for axis in "xyz")
     strengths = 3
     on_grid = "nodes"
 

@@ -15,7 +15,7 @@ class GravityScale(Effect):
 
     name = "gravity_scale"
     looks_like = "everything falls faster or slower than it should, straight down"
-    parameters = (EffectParameter("relative_change", "1", -1.0, 3.0, 0.001),)
+    parameters = (EffectParameter("relative_change", "1", -1.0, 3.0, 0.01),)
     on_grid = "nodes"
 
     def node_velocity(self):

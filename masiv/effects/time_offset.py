@@ -10,7 +10,7 @@ class TimeOffset(Effect):
 
     name = "time_offset"
     looks_like = "the motion is right but early or late by the same time throughout, most visible where it is fast"
-    parameters = (EffectParameter("delay", "s", -0.1, 0.1, 0.0005),)
+    parameters = (EffectParameter("delay", "s", -0.1, 0.1, 0.001),)
 
     def time_shift(self, theta):
         return theta[0]

@@ -19,7 +19,7 @@ class Viscosity(Effect):
 
     name = "viscosity"
     looks_like = "wobbles and bounces die out, while flight and spin are as they were"
-    parameters = (EffectParameter("viscosity", "Pa s", 0.0, 500.0, 2.0),)
+    parameters = (EffectParameter("viscosity", "Pa s", 0.0, 500.0, 10.0),)
     on_stress = True
 
     def particle_stress(self):
