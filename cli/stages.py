@@ -108,6 +108,57 @@ def estimated(run: RunFolder, config: Config, scene: Scene, progress: Progress) 
     return trajectory
 
 
+def held_out_trajectory(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Trajectory | None:
+    """The run's particles through all frames of ``scene``: those that the run held out are measured here, after every
+    fit and by none of them. None where no frame was held out.
+
+    Frames before ``run.fit_frames`` are those of the run. Made once: RUN/held_out keeps it. Raises InputError where the
+    run has no trajectory yet.
+    """
+    if run.fit_frames >= scene.frame_count:
+        return None
+    from masiv.continuum.extend import extend_trajectory
+    from masiv.continuum.trajectory import Trajectory
+    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.splat.follow import follow
+    from masiv.splat.follow_config import FollowConfig
+
+    folder = run.path / "held_out"
+    path = folder / "trajectory.npz"
+    if path.is_file():
+        return Trajectory.load(path)
+    runtime.start(config.arch)
+    given = load_trajectory(run)
+    seen = scene.restricted(holdout_cameras=run.holdout_cameras)
+    folder.mkdir(exist_ok=True)
+    checkpoint = run.checkpoint("held_out_gaussians")
+    if not (folder / "deformation.safetensors").is_file():
+        followed = follow(
+            seen,
+            load_dynamic(run),
+            config.reconstruct,
+            FollowConfig.model_validate({}),
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=progress,
+        )
+        followed.save(folder)
+    checkpoint.clear()
+    checkpoint = run.checkpoint("held_out_trajectory")
+    trajectory = extend_trajectory(
+        seen,
+        DynamicGaussians.load(folder),
+        given,
+        config.trajectory,
+        seed=config.seed,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+    trajectory.save(path)
+    checkpoint.clear()
+    return trajectory
+
+
 def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Twin:
     """The run's twin, made now where it lacks it, with material.json: what its law is in a tester's terms."""
     runtime.start(config.arch)

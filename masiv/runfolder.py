@@ -176,8 +176,9 @@ class RunFolder:
             if self.record["split"].get(key) != value
         ]
         sections = [s for stage in STAGES if self._begun(stage) for s in SECTIONS[stage]]
+        made_with = _with_defaults(self.config)
         for key in ["seed", *sections]:
-            differences += _differences(key, self.config.get(key), asked["config"].get(key))
+            differences += _differences(key, made_with.get(key), asked["config"].get(key))
         if differences:
             raise InputError(
                 f"{self.path} holds a run that was asked something else ({'; '.join(differences[:4])}"
@@ -233,6 +234,17 @@ def _new_record(request: Request) -> dict[str, Any]:
         "versions": _versions(),
         "stages": {stage: {"state": PENDING} for stage in STAGES},
     }
+
+
+def _with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
+    """``config`` with today's default for every key that masiv did not have when it was written."""
+    from masiv.config import Config
+
+    def over(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
+        both = {key: over(low[key], high[key]) for key in low if isinstance(low[key], dict) and key in high}
+        return {**low, **high, **both}
+
+    return over(Config().model_dump(mode="json"), config)
 
 
 def _differences(name: str, old: Any, new: Any) -> list[str]:

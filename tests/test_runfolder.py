@@ -91,6 +91,24 @@ def test_settings_of_a_stage_not_begun_may_change(tmp_path):
     assert RunFolder.open(path).done("reconstruct")
 
 
+def test_a_run_made_before_a_key_existed_opens(tmp_path):
+    """The missing key had what is the default today; asking for another value is another request."""
+    path = tmp_path / "run"
+    run = RunFolder.create_or_resume(path, request(tmp_path))
+    with run.stage("reconstruct"):
+        pass
+    record = yaml.safe_load((path / "run.yaml").read_text())
+    default = record["config"]["reconstruct"].pop("prune_opacity")
+    del record["config"]["simulator"]
+    (path / "run.yaml").write_text(yaml.safe_dump(record))
+    with pytest.raises(InputError, match=r"reconstruct\.prune_opacity"):
+        RunFolder.create_or_resume(path, request(tmp_path, reconstruct__prune_opacity=2 * default))
+    RunFolder.create_or_resume(path, request(tmp_path))
+    assert RunFolder.open(path).config["reconstruct"]["prune_opacity"] == default
+    with pytest.raises(InputError, match=r"reconstruct\.iterations"):
+        RunFolder.create_or_resume(path, request(tmp_path, reconstruct__iterations=7))
+
+
 def test_a_folder_with_something_else_is_left_alone(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/cat.jpg").write_text("cat")

@@ -30,8 +30,19 @@ if TYPE_CHECKING:
 
 _STENCILS = 256
 _ANCHORS = 768
+_KNOWN_FRAMES = 4
+_KNOWN_WEIGHT = 10.0
 _VOLUME_SLACK = 1.1
 """A frame's filled volume may exceed that of frame 0 by this factor; more is a part of the hull that no camera sees."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """Motion of the first K frames that stays: displacements (K, Q, 3) [m] of the particles, and a ``network`` of all
+    frames that has it, whose motion of the later ones is the first guess and the guide of the surface."""
+
+    displacements: torch.Tensor
+    network: DeformationNetwork
 
 
 @dataclass(frozen=True)
@@ -52,13 +63,15 @@ def fine_tune(
     seed: int,
     checkpoint: Checkpoint,
     progress: Progress,
+    known: Known | None = None,
 ) -> DeformationNetwork:
     """A copy of the motion of ``dynamic`` that carries ``start`` into ``volumes``, one a frame after 0. Resumable.
 
+    With ``known`` it begins as the network there, keeps the first frames' motion, and ``volumes`` are of the others.
     Raises MasivError where the loss becomes non-finite.
     """
-    problem = _Problem(scene, dynamic, start, config)
-    network = copy.deepcopy(dynamic.deformation).requires_grad_(True)
+    problem = _Problem(scene, dynamic, start, config, known)
+    network = copy.deepcopy(dynamic.deformation if known is None else known.network).requires_grad_(True)
     optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     first = 0
     state = checkpoint.load()
@@ -77,7 +90,7 @@ def fine_tune(
         for group in optimiser.param_groups:
             group["lr"] = config.learning_rate * (0.02 + 0.49 * (1 + math.cos(math.pi * iteration / config.iterations)))
         losses = problem.losses(network, matches, np.random.default_rng([seed, iteration]))
-        total = sum(getattr(config, f"{name}_weight") * value for name, value in losses.items())
+        total = sum(_weight(config, name) * value for name, value in losses.items())
         if not torch.isfinite(total):
             raise MasivError(
                 f"trajectory: the loss became non-finite at iteration {iteration}; lower trajectory.learning_rate"
@@ -93,15 +106,25 @@ def fine_tune(
 class _Problem:
     """What does not change while the network is tuned."""
 
-    def __init__(self, scene: Scene, dynamic: DynamicGaussians, start: FilledVolume, config: TrajectoryConfig) -> None:
-        self.config, self.spacing, self.ground = config, start.spacing, scene.ground
+    def __init__(
+        self,
+        scene: Scene,
+        dynamic: DynamicGaussians,
+        start: FilledVolume,
+        config: TrajectoryConfig,
+        known: Known | None,
+    ) -> None:
+        self.config, self.spacing, self.ground, self.known = config, start.spacing, scene.ground, known
         self.points = torch.as_tensor(start.points, dtype=torch.float32)
-        self.times = torch.as_tensor(scene.times[1:], dtype=torch.float32)
-        self.views = load_views(scene)[1:]
+        first = 1 if known is None else len(known.displacements)
+        self.known_times = torch.as_tensor(scene.times[:first], dtype=torch.float32)
+        self.times = torch.as_tensor(scene.times[first:], dtype=torch.float32)
+        self.views = load_views(scene)[first:]
         opaque = dynamic.canonical.opacities.detach().reshape(-1) > 0.1
         self.anchors = dynamic.canonical.means.detach()[opaque]
+        guide = dynamic.deformation if known is None else known.network
         with torch.no_grad():
-            self.anchor_motion = dynamic.deformation.displacements(self.anchors, self.times)
+            self.anchor_motion = guide.displacements(self.anchors, self.times)
 
     def losses(
         self, network: DeformationNetwork, matches: Matches, draw: np.random.Generator
@@ -131,6 +154,11 @@ class _Problem:
         }
         if self.ground is not None:
             losses["ground"] = below_ground(positions, self.ground).square().mean() * square
+        if self.known is not None:
+            frames = torch.as_tensor(draw.permutation(len(self.known_times))[:_KNOWN_FRAMES])
+            off = network.displacements(self.points[batch], self.known_times[frames])
+            off = off - self.known.displacements[frames[:, None], batch]
+            losses["known"] = off.square().sum(-1).mean() * square
         return losses
 
 
@@ -157,6 +185,10 @@ def match(moved: np.ndarray, volumes: list[FilledVolume], start: FilledVolume) -
         pulled = weights[t] > 0
         targets[t, pulled] = weighted[pulled] / weights[t, pulled, None]
     return Matches(torch.as_tensor(targets, dtype=torch.float32), torch.as_tensor(weights, dtype=torch.float32))
+
+
+def _weight(config: TrajectoryConfig, term: str) -> float:
+    return _KNOWN_WEIGHT if term == "known" else getattr(config, f"{term}_weight")
 
 
 def _state(network: DeformationNetwork, optimiser: torch.optim.Optimizer, iteration: int) -> dict[str, Any]:

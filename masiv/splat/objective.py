@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +22,15 @@ PULLED = 700
 
 @dataclass(frozen=True)
 class Objective:
-    """The loss of a fit. scale and half_extent [m] make lengths comparable; ``hulls`` pull, one for each frame."""
+    """The loss of a fit. scale and half_extent [m] make lengths comparable; ``hulls`` pull, one for each frame
+    that is drawn."""
 
     config: ReconstructConfig
     scale: float
     half_extent: float
     fps: float
     ground: Ground | None
-    hulls: tuple[HullPull, ...]
+    hulls: Sequence[HullPull] | Mapping[int, HullPull]
 
     def __call__(
         self,

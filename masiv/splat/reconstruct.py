@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from masiv.splat.observe import Observation, observe
 from masiv.splat.pull import HullPull, continue_motion
 from masiv.splat.start import Start, starting_point
 
-__all__ = ["DynamicGaussians", "reconstruct"]
+__all__ = ["DynamicGaussians", "observations", "reconstruct"]
 
 _NAMES = ("means", "log_scales", "opacity_logits", "colour_logits")
 
@@ -51,7 +52,7 @@ class _Fit:
         self, scene: Scene, config: ReconstructConfig, seed: int, state: dict | None, progress: Progress
     ) -> None:
         self.config, self.seed, self.scene = config, seed, scene
-        self.observations = _observations(scene, config)
+        self.observations = observations(scene, config, range(scene.frame_count))
         self.identity = repr((config.model_dump(), seed, str(scene.path), scene.frame_count, scene.views))
         progress("reconstruct", 0, config.iterations, "carving hulls")
         start = starting_point(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
@@ -205,10 +206,10 @@ class _Fit:
         self._find_neighbours()
 
 
-def _observations(scene: Scene, config: ReconstructConfig) -> list[list[Observation]]:
-    """What each frame shows. Raises MasivError for a frame that no view sees the object in."""
+def observations(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[list[Observation]]:
+    """What each of ``frames`` shows. Raises MasivError for a frame that no view sees the object in."""
     found = []
-    for frame in range(scene.frame_count):
+    for frame in frames:
         of_frame = [
             observe(scene, view, frame, crop_side=config.crop_side, crop_padding=config.crop_padding)
             for view in scene.views
