@@ -87,13 +87,13 @@ def refined(case, particles, laws):
     config = RefineConfig.model_validate({"particles": particles, "laws": laws})
     whole = SampledMotion(motion.positions, motion.times, motion.volume)
     cut = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
-    experiment, few, launch = experiment_of(
+    experiment, few, fewer, launch = experiment_of(
         "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config, seed=0
     )
     simulation = Simulation([experiment])
     noise = noise_floor_mm(cut.positions, launch.last_frame)
     began = time.time()
-    fits = baselines(simulation, few, min(launch.last_frame + 2, few.frames), config, Checkpoint(None), quiet)
+    fits = baselines(simulation, few, fewer, min(launch.last_frame + 2, few.frames), config, Checkpoint(None), quiet)
     middle = time.time()
     outcome = close_loop(simulation, fits, noise, config, quiet)
     first = outcome.rounds[0] if outcome.rounds else None

@@ -12,6 +12,7 @@ from .identify import identify
 from .inspect import inspect
 from .pretrain import pretrain
 from .reconstruct import reconstruct
+from .refine import refine
 from .simulate import simulate
 from .synth import synth
 from .trajectory import trajectory
@@ -24,7 +25,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-for function in (identify, inspect, reconstruct, trajectory, simulate, evaluate, pretrain, synth):
+for function in (identify, inspect, reconstruct, trajectory, refine, simulate, evaluate, pretrain, synth):
     app.command()(console.command(function))
 
 

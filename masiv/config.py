@@ -14,6 +14,7 @@ from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.mpm.config import SimulatorConfig
+from masiv.refine.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
 from masiv.strict import read_yaml, validated
 
@@ -32,6 +33,7 @@ class Config(BaseModel):
     trajectory: TrajectoryConfig = TrajectoryConfig.model_validate({})
     simulator: SimulatorConfig = SimulatorConfig.model_validate({})
     identify: IdentifyConfig = IdentifyConfig.model_validate({})
+    refine: RefineConfig = RefineConfig.model_validate({})
 
 
 def load_config(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,13 +23,31 @@ SCHEMA = 1
 
 
 @dataclass(frozen=True)
+class TwinEffect:
+    """An effect of ``masiv.effects.library`` by name, with ``values`` of all its parameters and their ``stderr`` (None:
+    not known). Vectors and places are in the simulation frame of the twin: +y up, its ``ground`` at y = 0."""
+
+    name: str
+    values: dict[str, float]
+    stderr: dict[str, float | None] = field(default_factory=dict)
+
+    def rows(self) -> list[tuple[str, float, str, float | None]]:
+        """(parameter, value, unit, standard error) in the order of the library. Raises InputError."""
+        from masiv.effects.library import effect_named
+
+        return [
+            (p.name, self.values[p.name], p.unit, self.stderr.get(p.name)) for p in effect_named(self.name).parameters
+        ]
+
+
+@dataclass(frozen=True)
 class Twin:
     """Geometry, initial motion, law and surroundings of one object. World frame, SI units.
 
     positions (Q, 3) float32 [m] at frame 0; velocity (3,) [m/s] of the centroid and omega (3,) [rad/s] about it;
     gravity (3,) [m/s^2]; ground: the effective plane (None: no ground); contact, friction: see
     ``masiv.mpm.simulator.Simulator``; volume [m^3]; density [kg/m^3]; up (3,); fps: of the video it came from. fit: how
-    the law was found (numbers with units).
+    the law was found (numbers with units). effects: what acts besides.
     """
 
     positions: np.ndarray
@@ -45,6 +64,7 @@ class Twin:
     law: Law
     simulator: SimulatorConfig
     fit: dict[str, Any] = field(default_factory=dict)
+    effects: tuple[TwinEffect, ...] = ()
 
     def save(self, folder: Path) -> None:
         """Write twin.yaml, law.safetensors and particles.safetensors, each complete or not at all."""
@@ -68,7 +88,7 @@ class Twin:
             "body": {"volume": _quantity(self.volume, "m^3"), "density": _quantity(self.density, "kg/m^3")},
             "up": _floats(self.up),
             "fps": self.fps,
-            "effects": [],
+            "effects": [_effect_entry(effect) for effect in self.effects],
             "simulator": self.simulator.model_dump(),
             "fit": self.fit,
         }
@@ -77,11 +97,12 @@ class Twin:
         os.replace(temporary, folder / "twin.yaml")
 
     @classmethod
-    def load(cls, folder: Path) -> Twin:
-        """Read what ``save`` wrote. Raises InputError where it is missing or is something else."""
+    def load(cls, folder: Path, name: str = "twin.yaml") -> Twin:
+        """Read what ``save`` wrote, from ``name`` in ``folder``. Raises InputError where it is missing or is something else, and for an effect or a
+        parameter that the library does not have."""
         from masiv.materials.load import load_law
 
-        path = folder / "twin.yaml"
+        path = folder / name
         try:
             document = yaml.safe_load(path.read_text(encoding="utf-8"))
             if document["schema"] != SCHEMA:
@@ -105,6 +126,7 @@ class Twin:
                 law=load_law(folder / document["law"]["file"]),
                 simulator=SimulatorConfig(**document["simulator"]),
                 fit=document["fit"],
+                effects=_read_effects(document["effects"], path),
             )
         except (OSError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
             raise InputError(f"{folder} holds no twin that can be read ({error}): run masiv identify") from error
@@ -116,3 +138,62 @@ def _floats(values: np.ndarray) -> list[float]:
 
 def _quantity(value: Any, unit: str) -> dict[str, Any]:
     return {"value": value, "unit": unit}
+
+
+def _effect_entry(effect: TwinEffect) -> dict[str, Any]:
+    parameters = {
+        name: {"value": float(value), "unit": unit, "stderr": None if stderr is None else float(stderr)}
+        for name, value, unit, stderr in effect.rows()
+    }
+    return {"effect": effect.name, "parameters": parameters}
+
+
+def _read_effects(entries: Any, path: Path) -> tuple[TwinEffect, ...]:
+    """The list ``effects`` of twin.yaml. Raises InputError that names file and key."""
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: effects must be a list")
+    found: list[TwinEffect] = []
+    for index, entry in enumerate(entries):
+        effect = _read_effect(entry, f"{path}: effects[{index}]")
+        if any(effect.name == other.name for other in found):
+            raise InputError(f"{path}: effects[{index}].effect: {effect.name} is there twice, keep one of them")
+        found.append(effect)
+    return tuple(found)
+
+
+def _read_effect(entry: Any, where: str) -> TwinEffect:
+    from masiv.effects.library import effect_named
+
+    if not isinstance(entry, dict) or set(entry) != {"effect", "parameters"}:
+        raise InputError(f"{where} must have the keys effect and parameters")
+    try:
+        known = {p.name: p for p in effect_named(str(entry["effect"])).parameters}
+    except InputError as error:
+        raise InputError(f"{where}.effect: {error}") from error
+    given = entry["parameters"]
+    if not isinstance(given, dict):
+        raise InputError(f"{where}.parameters must hold {', '.join(known)}")
+    for name in given:
+        if name not in known:
+            raise InputError(
+                f"{where}.parameters.{name}: {entry['effect']} has no such parameter, it has {', '.join(known)}"
+            )
+    values, errors = {}, {}
+    for name, p in known.items():
+        key = f"{where}.parameters.{name}"
+        row = given.get(name)
+        if not isinstance(row, dict) or "value" not in row:
+            raise InputError(f"{key} is missing: give it a value [{p.unit}]")
+        if row.get("unit", p.unit) != p.unit:
+            raise InputError(f"{key}.unit is {row['unit']}, it must be {p.unit}")
+        value, stderr = row["value"], row.get("stderr")
+        if not _is_number(value) or not p.lower <= value <= p.upper:
+            raise InputError(f"{key}.value is {value}, it must be a number from {p.lower:g} to {p.upper:g} {p.unit}")
+        if stderr is not None and not (_is_number(stderr) and stderr >= 0):
+            raise InputError(f"{key}.stderr is {stderr}, it must be a number of 0 or more, or null")
+        values[name], errors[name] = float(value), None if stderr is None else float(stderr)
+    return TwinEffect(entry["effect"], values, errors)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and not math.isnan(value)

@@ -99,6 +99,7 @@ class Problem:
             particle_mass=self.scene.density * self.volume / self.count,
             size=self.size,
             duration=self.frames / self.scene.fps,
+            frame_time=1 / self.scene.fps,
             path=torch.cat([self.start[None], self.targets[self.samples - 1 :: self.samples]]),
         )
 

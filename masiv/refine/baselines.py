@@ -14,12 +14,13 @@ from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model, Simulation, parameters
 from masiv.refine.refit import Fitted, column, full_fit, softness, started, summarised
 
-SHORT = 1 / 3
+SHORT, HALF = 1 / 3, 1 / 2
 
 
 def baselines(
     simulation: Simulation,
     few: Problem,
+    fewer: Problem,
     first_frames: int,
     config: RefineConfig,
     checkpoint: Checkpoint,
@@ -27,25 +28,27 @@ def baselines(
 ) -> list[Fitted]:
     """Fits of the classical laws that explain the motion best, without effects.
 
-    few: the first experiment's fitted frames alone. Every family is fitted in short to it, the best
-    ``config.families`` in full, these to all experiments. Raises MasivError where no law explains the motion.
+    few: the first experiment's fitted frames alone; fewer: the same with fewer particles. Where more than
+    ``config.families`` laws may compete, those best in a short fit to ``fewer`` do. They are fitted to ``few``,
+    then to all experiments. Raises MasivError where no law explains the motion.
     """
-    fits: list[FamilyFit] = []
     motion = simulation.experiments[0].motion
-    names = [n for n in FAMILIES if not config.laws or n in config.laws]
-    for kind in names:
-        try:
-            fits.append(fit_family(kind, few, motion, first_frames, checkpoint, progress, share=SHORT))
-        except MasivError as failed:
-            progress(f"refine: {kind}", 1, 1, str(failed))
-    if not fits:
-        raise MasivError("refine: no classical law explains the motion; look at its trajectory in the report")
-    best = [f.kind for f in ranked(fits)[: config.families]]
+    kinds = [n for n in FAMILIES if not config.laws or n in config.laws]
+    if len(kinds) > config.families:
+        short: list[FamilyFit] = []
+        for kind in kinds:
+            try:
+                short.append(fit_family(kind, fewer, motion, first_frames, Checkpoint(None), progress, share=SHORT))
+            except MasivError as failed:
+                progress(f"refine: {kind}", 1, 1, str(failed))
+        if not short:
+            raise MasivError("refine: no classical law explains the motion; look at its trajectory in the report")
+        kinds = [f.kind for f in ranked(short)[: config.families]]
     out = []
-    for done, kind in enumerate(best):
-        found = fit_family(kind, few, motion, first_frames, checkpoint, progress, further=True)
+    for done, kind in enumerate(kinds):
+        found = fit_family(kind, few, motion, first_frames, checkpoint, progress, share=HALF)
         out.append(_joint(simulation, found, config))
-        progress("refine: laws without effects", done + 1, len(best), f"{kind}: {out[-1].fit_mm:.1f} mm")
+        progress("refine: laws without effects", done + 1, len(kinds), f"{kind}: {out[-1].fit_mm:.1f} mm")
     return out
 
 

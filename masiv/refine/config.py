@@ -11,6 +11,7 @@ class RefineConfig(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     particles: int = Field(1500, ge=100, description="particles of the rollouts")
+    search_particles: int = Field(500, ge=100, description="particles of the short fits that choose the laws")
     samples_per_frame: int = Field(2, ge=1, le=16, description="instants per frame at which motions are compared")
     families: int = Field(2, ge=1, description="classical laws that compete, the best by their fit without any effect")
     laws: list[str] = Field([], description="families that compete; all where empty")
@@ -18,6 +19,9 @@ class RefineConfig(BaseModel):
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
     above_noise: float = Field(1.3, ge=1, description="residual over the noise floor below which nothing is looked for")
+    unexplained: float = Field(
+        4.0, ge=1, description="residual over the noise floor from which it is called unexplained, not nothing"
+    )
     least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")
     least_gain: float = Field(0.15, ge=0, le=1, description="share of the held-out error that an effect must remove")
     least_bic: float = Field(10.0, ge=0, description="how far an effect must lower the information criterion")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
-import numpy as np
 import torch
 
 from masiv.identify.config import IdentifyConfig
@@ -13,17 +10,8 @@ from masiv.identify.problem import Motion, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Experiment
+from masiv.refine.observed import Observed
 from masiv.scene.scene import Scene
-
-
-class Observed(Protocol):
-    """Motion of a body's particles: a trajectory, or tracks."""
-
-    positions: np.ndarray
-    times: np.ndarray
-    volume: float
-
-    def evaluate(self, times: np.ndarray) -> np.ndarray: ...
 
 
 def experiment_of(
@@ -36,13 +24,15 @@ def experiment_of(
     config: RefineConfig,
     *,
     seed: int,
-) -> tuple[Experiment, Problem, Launch]:
-    """The experiment, the problem of its fitted frames alone (on the same particles), and the launch.
+) -> tuple[Experiment, Problem, Problem, Launch]:
+    """The experiment, the problem of its fitted frames alone (on the same particles), that on few particles, and the
+    launch.
 
     fitted: the motion over the frames that may be fitted. whole: over all frames; only those after are taken from it.
     """
     settings = identify.model_copy(update={"samples_per_frame": config.samples_per_frame})
     few = Problem(scene, fitted, settings, simulator, particles=config.particles, seed=seed)
+    fewer = Problem(scene, fitted, settings, simulator, particles=config.search_particles, seed=seed)
     problem = Problem(scene, whole, settings, simulator, particles=config.particles, seed=seed)
     problem.targets[: len(few.targets)] = few.targets
     problem.start = few.start
@@ -52,4 +42,4 @@ def experiment_of(
         torch.as_tensor(few.axes.vectors_to_simulation(launch.omega), dtype=torch.float32),
         torch.zeros(()),
     )
-    return Experiment(name, problem, len(fitted.times), motion), few, launch
+    return Experiment(name, problem, len(fitted.times), motion), few, fewer, launch

@@ -1,0 +1,140 @@
+"""What ``masiv refine`` reads from a run folder and leaves in it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+
+from masiv.config import Config
+from masiv.progress import Progress
+from masiv.runfolder import RunFolder, write_json
+from masiv.scene.scene import Scene
+
+from . import stages
+
+if TYPE_CHECKING:
+    from masiv.refine.config import RefineConfig
+    from masiv.refine.stage import Refined, Throw
+    from masiv.twin import Twin
+
+BEFORE = "twin.before.yaml"
+LAW_BEFORE = "law.before.safetensors"
+
+
+def throw_of(path: Path, run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Throw:
+    """The motion of a run: what was fitted, and held-out frames measured in a pass of their own."""
+    from masiv.refine.stage import Throw, split_frames
+
+    trajectory = stages.load_trajectory(run)
+    held_out = stages.held_out_trajectory(run, config, scene, progress)
+    fitted = split_frames(scene.frame_count, run.fit_frames)
+    return Throw(path.resolve().name, scene, trajectory, held_out or trajectory, fitted)
+
+
+def load_twin(run: Path) -> Twin:
+    """The twin that identify made: refining again starts from that."""
+    from masiv.twin import Twin
+
+    return Twin.load(run, BEFORE if (run / BEFORE).is_file() else "twin.yaml")
+
+
+def save(
+    run: RunFolder,
+    scene: Scene,
+    throw: Throw,
+    found: Refined,
+    twin: Twin,
+    config: RefineConfig,
+    dry_run: bool,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write refine.json and refine.npz, and where an effect was accepted the new twin, its rollout and the report."""
+    from masiv.mpm.simulate import simulate
+    from masiv.refine.stage import twin_of
+    from masiv.refine.summary import summary
+    from masiv.report.material import MATERIAL
+
+    document = summary(found, config, dry_run=dry_run)
+    new = twin_of(found.outcome.after, throw, found.simulation, twin)
+    old = twin_of(found.outcome.before, throw, found.simulation, twin)
+    dynamic = stages.load_dynamic(run)
+    rollouts = {
+        name: simulate(model, frames=scene.frame_count, fps=scene.fps, progress=progress).positions
+        for name, model in (("before", old), ("after", new))
+    }
+    for name, positions in rollouts.items():
+        for split, numbers in _pictures(scene, dynamic, positions, throw, progress).items():
+            document[name][split] |= numbers
+    _save_fields(run.path / "refine.npz", found)
+    if document["accepted"] and not dry_run:
+        _keep_old(run.path)
+        new.save(run.path)
+        (run.path / MATERIAL).unlink(missing_ok=True)
+        _save_rollout(run, rollouts["after"], scene)
+    elif (run.path / BEFORE).is_file() and not dry_run:
+        twin.save(run.path)  # an earlier refine had accepted something that this one does not
+        (run.path / BEFORE).unlink()
+    write_json(run.path / "refine.json", document)
+    return document
+
+
+def _pictures(scene: Scene, dynamic, positions: np.ndarray, throw: Throw, progress: Progress) -> dict[str, dict]:
+    """Chamfer to the observed motion, and pictures against the video, over fitted and held-out frames."""
+    from masiv import metrics
+    from masiv.report import measure
+    from masiv.report.follow import Binding
+
+    binding = Binding.at_rest(dynamic.at(0.0), positions[0])
+    views = list(range(len(scene.cameras)))
+    out = {}
+    for split, frames in (
+        ("fit", list(range(1, throw.fitted))),
+        ("held_out", list(range(throw.fitted, scene.frame_count))),
+    ):
+        if not frames:
+            continue
+        numbers = measure.picture_numbers(scene, lambda f: binding.moved(positions[f]), views, frames) or {}
+        kept = {k: numbers[k] for k in ("psnr_db", "psnr_box_in_scene_db", "ssim", "mask_iou") if k in numbers}
+        chamfer = [metrics.chamfer_1e3mm2(positions[f], throw.whole.positions[f]) for f in frames]
+        out[split] = {"frames": frames, "chamfer_1e3mm2": float(np.mean(chamfer)), **kept}
+        progress("refine: pictures", 1 if split == "fit" else 2, 2)
+    return out
+
+
+def _save_fields(path: Path, found: Refined) -> None:
+    """Residuals of the first throw (K, N, 3) [m, world], simulated less observed, where they are and when."""
+    problem = found.simulation.experiments[0].problem
+    turn = problem.axes.vectors_to_world
+    temporary = path.with_suffix(".tmp.npz")
+    np.savez_compressed(
+        temporary,
+        before=turn(found.before[0]).astype(np.float32),
+        after=turn(found.after[0]).astype(np.float32),
+        positions=problem.axes.points_to_world(problem.start.double().numpy()).astype(np.float32),
+        times=np.arange(1, len(found.before[0]) + 1) / (problem.samples * problem.scene.fps),
+        fitted=found.simulation.experiments[0].rows,
+    )
+    os.replace(temporary, path)
+
+
+def _save_rollout(run: RunFolder, positions: np.ndarray, scene: Scene) -> None:
+    from masiv.mpm.simulate import Motion
+
+    Motion(positions, scene.times).save(run.rollout)
+
+
+def _keep_old(run: Path) -> None:
+    """twin.yaml as identify made it, beside the new one. A second refine keeps the first."""
+    if (run / BEFORE).is_file():
+        return
+    shutil.copyfile(run / "law.safetensors", run / LAW_BEFORE)
+    document = yaml.safe_load((run / "twin.yaml").read_text(encoding="utf-8"))
+    document["law"]["file"] = LAW_BEFORE
+    temporary = run / f"{BEFORE}.tmp"
+    temporary.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+    os.replace(temporary, run / BEFORE)

@@ -1,0 +1,144 @@
+"""The refine stage: residual -> ranked effects -> joint refit -> confirmed on held-out frames -> twin with effects."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from masiv import runtime
+from masiv.checkpoint import Checkpoint
+from masiv.identify.config import IdentifyConfig
+from masiv.identify.families import law_of
+from masiv.mpm.config import SimulatorConfig
+from masiv.progress import Progress, silent
+from masiv.refine.baselines import baselines
+from masiv.refine.config import RefineConfig
+from masiv.refine.loop import Outcome, close_loop
+from masiv.refine.model import Simulation, effect_parameters, throw_of
+from masiv.refine.noise import noise_floor_mm
+from masiv.refine.observed import Observed, first_frames
+from masiv.refine.prepare import experiment_of
+from masiv.refine.propose import Proposal, propose
+from masiv.refine.refit import Fitted
+from masiv.scene.scene import Ground, Scene
+from masiv.twin import Twin, TwinEffect
+
+COMPETITORS = {
+    "jelly": ("neo_hookean", "von_mises"),
+    "plasticine": ("von_mises", "neo_hookean", "non_newtonian"),
+    "water": ("newtonian", "non_newtonian"),
+    "sand": ("drucker_prager", "von_mises"),
+}
+"""Classical laws that are worth a try, by the pretrained law whose rollout was nearest to the motion in identify."""
+
+
+@dataclass(frozen=True)
+class Throw:
+    """One run. whole: the motion of all frames, of which the first ``fitted`` may be fitted; ``motion`` is of those."""
+
+    name: str
+    scene: Scene
+    motion: Observed
+    whole: Observed
+    fitted: int
+
+
+@dataclass(frozen=True)
+class Refined:
+    """What was found. fields: residuals before and after, simulated less observed, (K, N, 3) [m, simulation frame] of
+    each throw over all frames, at ``samples_per_frame`` instants a frame."""
+
+    outcome: Outcome
+    noise_mm: float
+    simulation: Simulation
+    before: list[np.ndarray]
+    after: list[np.ndarray]
+    proposal: Proposal | None
+
+
+def split_frames(frame_count: int, fit_frames: int) -> int:
+    """How many frames refine fits: those that identify did, or all but the last quarter where it was given all."""
+    return fit_frames if fit_frames < frame_count else frame_count - max(1, frame_count // 4)
+
+
+def refine(
+    throws: list[Throw],
+    identify: IdentifyConfig,
+    simulator: SimulatorConfig,
+    config: RefineConfig,
+    *,
+    start: str | None = None,
+    dry_run: bool = False,
+    seed: int = 0,
+    checkpoint: Checkpoint | None = None,
+    progress: Progress = silent,
+) -> Refined:
+    """Look for what the model lacks. throws: of one body, the first to be refined. start: the twin's pretrained law,
+    which chooses the competing classical laws unless ``config.laws`` does. dry_run: rank the effects, fit none.
+
+    Raises MasivError where no classical law explains the motion.
+    """
+    with runtime.torch_threads(1):
+        if not config.laws and start in COMPETITORS:
+            config = config.model_copy(update={"laws": list(COMPETITORS[start])})
+        made = [
+            experiment_of(
+                t.name, t.scene, first_frames(t.motion, t.fitted), t.whole, identify, simulator, config, seed=seed
+            )
+            for t in throws
+        ]
+        simulation = Simulation([experiment for experiment, *_ in made])
+        _, few, fewer, launch = made[0]
+        noise = noise_floor_mm(first_frames(throws[0].motion, throws[0].fitted).positions, launch.last_frame)
+        fits = baselines(
+            simulation,
+            few,
+            fewer,
+            min(launch.last_frame + 2, few.frames),
+            config,
+            checkpoint or Checkpoint(None),
+            progress,
+        )
+        if dry_run:
+            config = config.model_copy(update={"shortlist": 0, "above_noise": 1.0})
+        outcome = close_loop(simulation, fits, noise, config, progress)
+        before = simulation.fields(outcome.before.model, outcome.before.values, held_out=True)
+        after = simulation.fields(outcome.after.model, outcome.after.values, held_out=True)
+        proposal = None if dry_run else propose(simulation, outcome, progress)
+        return Refined(outcome, noise, simulation, before, after, proposal)
+
+
+def twin_of(fitted: Fitted, throw: Throw, simulation: Simulation, old: Twin) -> Twin:
+    """``old`` with the law, throw, ground and effects of ``fitted``."""
+    experiment = simulation.experiments[0]
+    motion = throw_of(fitted.values, experiment)
+    axes = experiment.problem.axes
+    law = law_of(fitted.model.family, fitted.values)
+    law.stderr = {n: fitted.stderr[n] for n in law.values if math.isfinite(fitted.stderr.get(n, math.inf))}
+    ground = throw.scene.ground
+    if ground is not None:
+        ground = Ground(ground.normal, ground.height + float(motion.ground_offset))
+    effects = tuple(
+        TwinEffect(
+            name,
+            {p.name.split(".")[1]: fitted.values[p.name] for p in effect_parameters(name)},
+            {p.name.split(".")[1]: _known(fitted.stderr[p.name]) for p in effect_parameters(name)},
+        )
+        for name in fitted.model.effects
+    )
+    return replace(
+        old,
+        velocity=axes.vectors_to_world(motion.velocity.double().numpy()),
+        omega=axes.vectors_to_world(motion.omega.double().numpy()),
+        ground=ground,
+        contact=fitted.model.contact,
+        law=law,
+        effects=effects,
+        fit={**old.fit, "refined": {"fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}},
+    )
+
+
+def _known(error: float) -> float | None:
+    return error if math.isfinite(error) else None

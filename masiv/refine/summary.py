@@ -1,0 +1,180 @@
+"""refine.json: what was found, as the contract of the run folder has it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from masiv.effects.library import effect_named
+from masiv.refine.config import RefineConfig
+from masiv.refine.loop import Round
+from masiv.refine.model import effect_parameters
+from masiv.refine.refit import Fitted, rms_mm, split
+from masiv.refine.score import Candidate
+from masiv.refine.stage import Refined
+
+ADDED, NOTHING, UNEXPLAINED = "effect added", "nothing missing", "unexplained residual"
+
+
+def verdict(found: Refined, config: RefineConfig) -> str:
+    """What the search came to."""
+    outcome = found.outcome
+    if outcome.after.model.effects:
+        return ADDED
+    return UNEXPLAINED if outcome.after.fit_mm > config.unexplained * found.noise_mm else NOTHING
+
+
+def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str, Any]:
+    """The document; ``before`` and ``after`` hold the motion's error, pictures are added by whoever has them."""
+    outcome = found.outcome
+    first = outcome.rounds[0] if outcome.rounds else None
+    proposal = found.proposal
+    return {
+        "schema": 1,
+        "noise_floor_mm": found.noise_mm,
+        "residual_mm": {"fit": outcome.before.fit_mm, "held_out": outcome.before.held_out_mm},
+        "candidates": [_candidate(c, first) for c in first.candidates] if first else [],
+        "accepted": [_accepted(name, outcome.after) for name in outcome.after.model.effects],
+        "before": _errors(found, found.before),
+        "after": _errors(found, found.after),
+        "unexplained": unexplained(found),
+        "verdict": "ranked only" if dry_run else verdict(found, config),
+        "laws": {"before": outcome.before.model.family.kind, "after": outcome.after.model.family.kind},
+        "rounds": [_round(r) for r in outcome.rounds],
+        "next_experiment": None if proposal is None else {
+            "tells_apart": list(proposal.between),
+            "velocity": {"value": proposal.velocity.tolist(), "unit": "m/s"},
+            "omega": {"value": proposal.omega.tolist(), "unit": "rad/s"},
+            "predicted_difference_mm": proposal.difference_mm,
+            "difference_in_this_throw_mm": proposal.present_mm,
+        },
+        "rollouts": found.simulation.rollouts,
+    }  # fmt: skip
+
+
+def _candidate(candidate: Candidate, first: Round) -> dict[str, Any]:
+    effect = effect_named(candidate.effect)
+    own = effect_parameters(effect.name)
+    strengths = own[: effect.strengths]
+    size = math.sqrt(sum(candidate.theta[p.name] ** 2 for p in strengths))
+    one = len(strengths) == 1
+    return {
+        "effect": candidate.effect,
+        "explained": candidate.explained,
+        "theta": candidate.theta[strengths[0].name] if one else size,
+        "unit": effect.parameters[0].unit,
+        "stderr": candidate.stderr[strengths[0].name]
+        if one
+        else math.sqrt(sum(candidate.stderr[p.name] ** 2 for p in strengths)),
+        "parameters": {p.name.split(".")[1]: candidate.theta[p.name] for p in own},
+        "confusable_with": first.confusable.get(candidate.effect, []),
+        "looks_like": effect.looks_like,
+    }
+
+
+def _accepted(name: str, fitted: Fitted) -> dict[str, Any]:
+    own = effect_parameters(name)
+    short = {p.name: p.name.split(".")[1] for p in own}
+    return {
+        "effect": name,
+        "theta": {short[p.name]: fitted.values[p.name] for p in own},
+        "stderr": {short[p.name]: fitted.stderr[p.name] for p in own},
+        "unit": {q.name: q.unit for q in effect_named(name).parameters},
+    }
+
+
+def _round(done: Round) -> dict[str, Any]:
+    """The refits that competed, best first."""
+    return {
+        "base": {"law": done.base.model.family.kind, "effects": list(done.base.model.effects)},
+        "refits": [
+            {
+                "law": t.fitted.model.family.kind,
+                "effect": t.candidate.effect,
+                "explained": t.candidate.explained,
+                "fit_rmse_mm": t.fitted.fit_mm,
+                "held_out_rmse_mm": t.fitted.held_out_mm,
+                "parameters": {
+                    p.name.split(".")[1]: {"value": t.fitted.values[p.name], "stderr": t.fitted.stderr[p.name]}
+                    for p in effect_parameters(t.candidate.effect)
+                },
+                "information_gain": done.base.bic(t.fitted.samples) - t.fitted.bic(t.fitted.samples),
+                "accepted": done.accepted is t,
+                "objections": t.reasons,
+            }
+            for t in done.trials
+        ],
+    }
+
+
+def _errors(found: Refined, fields: list[np.ndarray]) -> dict[str, Any]:
+    fit, rest = split(fields, found.simulation.experiments)
+    return {
+        "fit": {"trajectory_rmse_mm": rms_mm(fit)},
+        "held_out": {"trajectory_rmse_mm": rms_mm(rest)} if rest else {},
+    }
+
+
+def unexplained(found: Refined) -> dict[str, Any]:
+    """What is left of the first throw's residual, and where and when it is largest."""
+    experiment = found.simulation.experiments[0]
+    problem = experiment.problem
+    field = found.after[0]
+    size = np.linalg.norm(field, axis=2)
+    by_instant = 1e3 * np.sqrt((size**2).mean(1))
+    worst = int(by_instant.argmax())
+    by_particle = (size**2).mean(0)
+    weight = by_particle * (by_particle >= np.quantile(by_particle, 0.9))
+    rest = problem.start.double().numpy()
+    where = (weight[:, None] * rest).sum(0) / max(weight.sum(), 1e-300)
+    return {
+        "rmse_mm": 1e3 * float(np.sqrt((size**2).mean())),
+        "noise_floor_mm": found.noise_mm,
+        "worst_frame": (worst + 1) / problem.samples,
+        "worst_frame_rmse_mm": float(by_instant[worst]),
+        "rmse_mm_by_instant": by_instant.tolist(),
+        "worst_place_at_frame_0_m": problem.axes.points_to_world(where[None])[0].tolist(),
+        "worst_place_rmse_mm": 1e3 * float(np.sqrt(by_particle[weight > 0].mean())) if weight.any() else 0.0,
+    }
+
+
+def text(document: dict[str, Any]) -> str:
+    """The document for a terminal."""
+    before, after = document["before"], document["after"]
+    lines = [
+        f"noise floor {document['noise_floor_mm']:.1f} mm, residual {document['residual_mm']['fit']:.1f} mm fitted"
+        + _held(document["residual_mm"]["held_out"])
+    ]
+    for c in document["candidates"][:6]:
+        alike = f"  (looks like {', '.join(c['confusable_with'])})" if c["confusable_with"] else ""
+        lines.append(f"  {c['effect']:20s} explains {100 * c['explained']:3.0f} %  {c['theta']:.3g} {c['unit']}{alike}")
+    for refits in document["rounds"]:
+        for r in refits["refits"]:
+            why = "accepted" if r["accepted"] else "; ".join(r["objections"]) or "another was better"
+            lines.append(
+                f"  refit {r['effect']} ({r['law']}): {r['fit_rmse_mm']:.1f} mm{_held(r['held_out_rmse_mm'])}: {why}"
+            )
+    for a in document["accepted"]:
+        values = ", ".join(f"{n} {v:.4g} ± {a['stderr'][n]:.2g} {a['unit'][n]}" for n, v in a["theta"].items())
+        lines.append(f"{a['effect']}: {values}")
+    lines.append(
+        f"before {before['fit']['trajectory_rmse_mm']:.1f} mm{_held(before['held_out'].get('trajectory_rmse_mm'))}, "
+        f"after {after['fit']['trajectory_rmse_mm']:.1f} mm{_held(after['held_out'].get('trajectory_rmse_mm'))}"
+    )
+    n = document["next_experiment"]
+    if n is not None:
+        lines.append(
+            f"{' and '.join(n['tells_apart'])} look alike here; a throw at {_vector(n['velocity'])} m/s with spin "
+            f"{_vector(n['omega'])} rad/s would set them {n['predicted_difference_mm']:.0f} mm apart"
+        )
+    return "\n".join([*lines, document["verdict"]])
+
+
+def _held(value: float | None) -> str:
+    return "" if value is None else f", {value:.1f} mm held out"
+
+
+def _vector(quantity: dict[str, Any]) -> str:
+    return "(" + ", ".join(f"{v:.1f}" for v in quantity["value"]) + ")"
