@@ -98,8 +98,8 @@ class Twin:
 
     @classmethod
     def load(cls, folder: Path, name: str = "twin.yaml") -> Twin:
-        """Read what ``save`` wrote, from ``name`` in ``folder``. Raises InputError where it is missing or is something else, and for an effect or a
-        parameter that the library does not have."""
+        """Read what ``save`` wrote, from ``name`` in ``folder``. Raises InputError where it is missing or is something
+        else, and for an effect or a parameter that the library does not have."""
         from masiv.materials.load import load_law
 
         path = folder / name
