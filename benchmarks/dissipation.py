@@ -12,9 +12,11 @@ import argparse
 import json
 import math
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.linalg import expm
 from scipy.optimize import brentq, least_squares
 
 from masiv import runtime
@@ -31,20 +33,19 @@ THICKNESS, LENGTH, DENSITY = 0.03, 0.1, 1070.0
 
 def bar(thickness: float = THICKNESS, length: float = LENGTH, gravity: float = 9.8) -> Tracks:
     """A bar along z from 0 to ``length`` [m], held at z <= 0; gravity along -x. One marker in the middle of its tip."""
-    from pathlib import Path
-
     declared = GeometryDeclaration(units="m", box=(thickness, thickness, length))
     geometry = make_geometry(declared, Path())
     clamp = Clamp(np.array([[0.0, 0.0, 1.0]]), np.array([-length / 2]), ())
     body = Body("bar", "bar", geometry, DENSITY, DENSITY * geometry.volume, None, clamp)
     tip = np.array([0.0, 0.0, length])
+    placement = Placement(np.eye(3), np.array([0.0, 0.0, length / 2]))
     run = Run("tip", "bar", "", "fit", ("tip",), np.array([0.0, 1.0, 2.0]), np.tile(tip, (3, 1, 1)), 1.0, slice(0, 3),
-              0.0, Placement(np.eye(3), np.array([0.0, 0.0, length / 2])))  # fmt: skip
+              tip[None], None, 0.0, placement)  # fmt: skip
     return Tracks(Path("bar"), np.array([1.0, 0, 0]), np.array([-gravity, 0, 0]), None, {"bar": body}, (run,))
 
 
 def cantilever_hz(youngs: float, poisson: float, thickness: float = THICKNESS, length: float = LENGTH) -> float:
-    """First frequency [Hz] of Timoshenko's cantilever of square section, shear coefficient 10(1+ν)/(12+11ν) (Cowper)."""
+    """First frequency [Hz] of Timoshenko's cantilever, square section, shear coefficient 10(1+ν)/(12+11ν) (Cowper)."""
     area, inertia = thickness**2, thickness**4 / 12
     shear = youngs / (2 * (1 + poisson)) * 10 * (1 + poisson) / (12 + 11 * poisson) * area
     bending, mass, rotary = youngs * inertia, DENSITY * area, DENSITY * inertia
@@ -53,8 +54,6 @@ def cantilever_hz(youngs: float, poisson: float, thickness: float = THICKNESS, l
         """Of the conditions at the free end over the two solutions that are clamped at 0 (transfer matrix)."""
         a = np.array([[0, 1, 0, 1 / shear], [0, 0, 1 / bending, 0], [0, -rotary * omega**2, 0, -1.0],
                       [-mass * omega**2, 0, 0, 0]])  # fmt: skip
-        from scipy.linalg import expm
-
         return float(np.linalg.det(expm(a * length)[2:, 2:]))  # state: deflection, rotation, moment, force
 
     euler = 1.875104**2 / (2 * math.pi * length**2) * math.sqrt(bending / mass)

@@ -1,1 +1,1 @@
-"""Measured points as the observation: motion capture, tracked points, heights. Reading is light: no torch, no taichi."""
+"""Measured points as the observation: motion capture, heights, tracked points. Reading needs no torch and no taichi."""

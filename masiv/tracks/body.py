@@ -20,7 +20,7 @@ from masiv.mpm.simulator import Simulator, State
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.attach import Attachment, attach
 from masiv.tracks.geometry import Geometry
-from masiv.tracks.tracks import Body, Run, Tracks
+from masiv.tracks.tracks import Run, Tracks
 
 if TYPE_CHECKING:
     from masiv.materials.law import Law
@@ -110,11 +110,10 @@ def simulated_body(
         frame, heights = _on_nodes(frame, placement.to_world(own), normals, heights, spacing)
     particles = frame.points_to_simulation(placement.to_world(own))
     held = body.clamp.markers if body.clamp is not None else ()
-    at_rest_now = run.rest_positions()
-    free = tuple(m for m, name in enumerate(run.markers) if name not in held and np.isfinite(at_rest_now[m]).all())
+    free = tuple(m for m, name in enumerate(run.markers) if name not in held and np.isfinite(run.at_rest[m]).all())
     if not free:
         raise InputError(f"run {run.name}: no marker with all three axes moves with the material")
-    attachment = attach(particles, frame.points_to_simulation(at_rest_now[list(free)]), particle_spacing)
+    attachment = attach(particles, frame.points_to_simulation(run.at_rest[list(free)]), particle_spacing)
     return SimulatedBody(
         particles=torch.as_tensor(particles),
         volume=body.geometry.volume,
@@ -176,10 +175,12 @@ def plan(
     dtype: torch.dtype = torch.float32,
     substep: float | None = None,
 ) -> Plan:
-    """How to simulate from the release to ``times`` (T,) [s since then, not negative], up to ``speed`` [m/s].
+    """How to simulate from the release to ``times`` (T,) [s since then, ascending], up to ``speed`` [m/s].
 
     ``substep`` [s] takes the place of the one that ``config`` gives.
     """
+    if times[0] < 0 or not times[-1] > 0:
+        raise InputError("a simulation runs from the release on: give times from 0 s, such as those of run.moving()")
     last = float(times[-1])
     if substep is None:
         frame_time = last / max(len(times) - 1, 1)

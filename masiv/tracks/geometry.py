@@ -57,7 +57,7 @@ class Geometry:
 
 
 def make_geometry(declared: GeometryDeclaration, folder: Path) -> Geometry:
-    """The solid that ``declared`` says; mesh files are relative to ``folder``. Raises InputError for an unusable mesh."""
+    """The solid that ``declared`` says; mesh files are relative to ``folder``. InputError for an unusable mesh."""
     import trimesh
 
     unit = METRES[declared.units]

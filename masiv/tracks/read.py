@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from masiv.tracks.geometry import Geometry, make_geometry
 from masiv.tracks.placement import Placement, best_rigid
 from masiv.tracks.release import found_release
 from masiv.tracks.table import Table, read_table
-from masiv.tracks.tracks import Body, Clamp, Run, Tracks
+from masiv.tracks.tracks import Body, Clamp, Run, Tracks, rest_of
 
 LOOKED_FOR = "scene.yaml with layout: tracks"
 
@@ -104,40 +105,47 @@ def _run(
     run: RunDeclaration, declared: TracksDeclaration, bodies: dict[str, Body], folder: Path, problems: list[str]
 ) -> Run:
     values = [str(value) for value in run.select.values()]
-    name = run.name or " ".join([run.file.stem, *values] if not values else values)
-    where = f"scene.yaml: run {name}"
+    name = run.name or " ".join(values) or run.file.stem
+    where = f"run {name}"
     body = run.body if run.body is not None else next(iter(bodies))
     if body not in bodies or (run.body is None and len(bodies) > 1):
-        raise InputError(f"{where}: say which body it is of: one of {', '.join(bodies)}")
+        raise InputError(f"scene.yaml: {where}: say which body it is of: one of {', '.join(bodies)}")
     table = read_table(folder / run.file, declared.columns, run.select)
     markers, positions = _kept(where, run, table)
     positions = positions * _unit(where, table, declared, problems)
     times, rate = _times(where, table, declared, problems)
     if table.ignored:
-        problems.append(f"run {name}: columns not used: {', '.join(table.ignored)}")
+        problems.append(f"{where}: columns not used: {', '.join(table.ignored)}")
     for m, marker in enumerate(markers):
         if not np.isfinite(positions[:, m]).any():
-            raise InputError(f"{where}: marker {marker} was never seen: leave it out with markers")
+            raise InputError(f"scene.yaml: {where}: marker {marker} was never seen: leave it out with markers")
     rest = None
     if run.rest_frames is not None:
         if run.rest_frames[1] > len(times):
-            raise InputError(f"{where}: rest_frames end at {run.rest_frames[1]}, the run has {len(times)} frames")
+            raise InputError(
+                f"scene.yaml: {where}: rest_frames end at {run.rest_frames[1]}, the run has {len(times)} frames"
+            )
         rest = slice(*run.rest_frames)
     clamped = bodies[body].clamp
     for marker in clamped.markers if clamped else ():
         if marker not in markers:
-            problems.append(f"run {name}: marker {marker} of the clamp is not in it")
-    made = Run(name, body, run.condition, run.use, markers, times, positions, rate, rest, run.release_time, None)
+            problems.append(f"{where}: marker {marker} of the clamp is not in it")
     if run.release_time is not None and not times[0] <= run.release_time < times[-1]:
-        raise InputError(f"{where}: release_time {run.release_time:g} is outside of {times[0]:g} to {times[-1]:g} s")
-    if rest is not None and run.release_time is None:
+        raise InputError(
+            f"scene.yaml: {where}: release_time {run.release_time:g} is outside of {times[0]:g} to {times[-1]:g} s"
+        )
+    at_rest, noise = rest_of(positions, rest)
+    for m, marker in enumerate(markers):
+        if np.isnan(at_rest[m][np.isfinite(positions[:, m]).any(axis=0)]).any():
+            problems.append(f"{where}: marker {marker} is not seen at rest, so it is not tied to the body")
+    release = run.release_time
+    if rest is not None and noise is not None and release is None:
         free = [m for m, marker in enumerate(markers) if not (clamped and marker in clamped.markers)]
-        release = found_release(times, positions[:, free], rest)
+        release = found_release(times, positions[:, free], rest, at_rest[free], noise[free])
         if release is None:
-            problems.append(f"run {name}: it never leaves its rest position by more than the noise: no release found")
-        made = Run(name, body, run.condition, run.use, markers, times, positions, rate, rest, release, None)
-    placement = _placement(where, made, declared.bodies[body], problems)
-    made = Run(**{**vars(made), "placement": placement})
+            problems.append(f"{where}: it never leaves its rest position by more than the noise: no release found")
+    made = Run(name, body, run.condition, run.use, markers, times, positions, rate, rest, at_rest, noise, release, None)
+    made = replace(made, placement=_placement(where, made, declared.bodies[body], problems))
     return made if run.time is None else made.between(*run.time)
 
 
@@ -146,16 +154,18 @@ def _kept(where: str, run: RunDeclaration, table: Table) -> tuple[tuple[str, ...
         return table.markers, table.positions
     for marker in run.markers:
         if marker not in table.markers:
-            raise InputError(f"{where}: no marker '{marker}' in {run.file}: it has {', '.join(table.markers)}")
+            raise InputError(
+                f"scene.yaml: {where}: no marker '{marker}' in {run.file}: it has {', '.join(table.markers)}"
+            )
     return run.markers, table.positions[:, [table.markers.index(marker) for marker in run.markers]]
 
 
 def _unit(where: str, table: Table, declared: TracksDeclaration, problems: list[str]) -> float:
     """Metres in a unit of the file. What scene.yaml says wins."""
     if declared.units is None and table.unit is None:
-        raise InputError(f"{where}: its file does not say its unit: give `units: m`, cm or mm")
+        raise InputError(f"scene.yaml: {where}: its file does not say its unit: give `units: m`, cm or mm")
     if declared.units is not None and table.unit not in (None, declared.units):
-        problems.append(f"{where[12:]}: the file says {table.unit}, scene.yaml {declared.units}: the latter is used")
+        problems.append(f"{where}: the file says {table.unit}, scene.yaml {declared.units}: the latter is used")
     return METRES[declared.units or table.unit or "m"]
 
 
@@ -163,29 +173,29 @@ def _times(where: str, table: Table, declared: TracksDeclaration, problems: list
     """Times (T,) [s] and the rate [Hz]."""
     count = len(table.positions)
     if count < 3:
-        raise InputError(f"{where} has {count} frames: a motion needs three or more")
+        raise InputError(f"scene.yaml: {where} has {count} frames: a motion needs three or more")
     if table.times is None:
         if declared.rate is None:
-            raise InputError(f"{where}: its file has no time: name the column in columns.time, or give rate [Hz]")
+            raise InputError(
+                f"scene.yaml: {where}: its file has no time: name the column in columns.time, or give rate [Hz]"
+            )
         return np.arange(count) / declared.rate, declared.rate
     times = table.times
     if not np.isfinite(times).all():
-        raise InputError(f"{where}: frame {int(np.argmin(np.isfinite(times)))} has no time")
+        raise InputError(f"scene.yaml: {where}: frame {int(np.argmin(np.isfinite(times)))} has no time")
     steps = np.diff(times)
     if steps.min() <= 0:
         frame = int(np.argmax(steps <= 0)) + 1
         raise InputError(
-            f"{where}: time goes from {times[frame - 1]:g} to {times[frame]:g} s at frame {frame}, it must increase"
-            " (a file of several recordings needs select)"
+            f"scene.yaml: {where}: time goes from {times[frame - 1]:g} to {times[frame]:g} s at frame {frame}, it must "
+            "increase (a file of several recordings needs select)"
         )
     usual = float(np.median(steps))
     uneven = float(np.abs(steps / usual - 1).max())
     if uneven > 0.05:
-        problems.append(
-            f"{where[12:]}: frames are not even: {1e3 * steps.min():.1f} to {1e3 * steps.max():.1f} ms apart"
-        )
+        problems.append(f"{where}: frames are not even: {1e3 * steps.min():.1f} to {1e3 * steps.max():.1f} ms apart")
     if declared.rate is not None and abs(declared.rate * usual - 1) > 0.01:
-        problems.append(f"{where[12:]}: rate {declared.rate:g} Hz, but its times say {1 / usual:.4g}: times are used")
+        problems.append(f"{where}: rate {declared.rate:g} Hz, but its times say {1 / usual:.4g}: times are used")
     return times, 1 / usual
 
 
@@ -200,22 +210,25 @@ def _placement(where: str, run: Run, body: BodyDeclaration, problems: list[str])
         return Placement(turn, np.zeros(3) if declared.position is None else np.array(declared.position))
     markers = list(declared.markers_at)
     own = METRES[declared.units] * np.array([declared.markers_at[marker] for marker in markers])
-    world = run.rest_positions()[[run.marker(marker) for marker in markers]]
+    world = run.at_rest[[run.marker(marker) for marker in markers]]
     if len(markers) == 1:
         # An axis that was not measured is 0: the scene has no other origin for it.
         return Placement(turn, np.where(run.axes[run.marker(markers[0])], world[0], 0.0) - turn @ own[0])
     if not np.isfinite(world).all():
         raise InputError(
-            f"{where}: geometry.markers_at needs all axes of {', '.join(markers)} at rest: lengthen rest_frames"
+            f"scene.yaml: {where}: geometry.markers_at needs all axes of {', '.join(markers)} at rest: "
+            "lengthen rest_frames"
         )
     for name, points in (("markers_at", own), ("the rest positions", world)):
         if np.linalg.svd(points - points.mean(0), compute_uv=False)[1] < 1e-6 * np.ptp(points, axis=0).max():
-            raise InputError(f"{where}: {name} of {', '.join(markers)} lie on a line: name one that does not")
+            raise InputError(
+                f"scene.yaml: {where}: {name} of {', '.join(markers)} lie on a line: name one that does not"
+            )
     placement = best_rigid(own, world)
     size = float(np.ptp(own, axis=0).max())
     if placement.error > 0.03 * size:
         problems.append(
-            f"{where[12:]}: markers are {1e3 * placement.error:.1f} mm (RMS) from geometry.markers_at after the best"
+            f"{where}: markers are {1e3 * placement.error:.1f} mm (RMS) from geometry.markers_at after the best"
             " rigid motion: check their order and units"
         )
     return placement

@@ -3,36 +3,42 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import nnls
 
 SIGMAS = 6.0
-"""A marker moves where it is farther from its rest than that many standard deviations of its noise."""
+"""A marker has left its rest where it is farther away than that many standard deviations of its noise …"""
+SHARE = 0.02
+"""… and than that share of its usual travel, since what holds a body creeps …"""
 LASTING = 3
 """… in as many frames running."""
+BEFORE = 12
+"""Frames before that in which the release is looked for, in steps of a twentieth of a frame."""
 
 
-def found_release(times: np.ndarray, positions: np.ndarray, rest: slice) -> float | None:
+def found_release(
+    times: np.ndarray, positions: np.ndarray, rest: slice, at_rest: np.ndarray, noise: np.ndarray
+) -> float | None:
     """The time [s] of the release, or None where nothing ever moves.
 
-    times (T,) [s]; positions (T, M, 3) [m]; rest: frames at rest. The farthest marker from its rest decides. From rest,
-    distance grows as ½ a (t − t0)², so its square root is a line in time: t0 is where that of the first two moving
-    frames is zero, kept within the frame before the first of them.
+    times (T,) [s]; positions (T, M, 3), at_rest and noise (M, 3) [m], see ``Run``; rest: frames at rest. The distance
+    of the farthest marker from its rest is 0 before the release t0 and v (t − t0) + a (t − t0)² after it, v and a not
+    negative: t0 is where that fits best.
     """
-    at_rest = positions[rest]
-    known = np.isfinite(at_rest)
-    count = np.maximum(known.sum(0), 1)
-    middle = np.where(known, at_rest, 0.0).sum(0) / count
-    off = np.where(known, at_rest - middle, 0.0)
-    noise = np.sqrt((off**2).sum(0) / np.maximum(count - 1, 1))
-    distance = np.where(np.isfinite(positions), np.abs(positions - middle), 0.0)
-    threshold = np.maximum(SIGMAS * noise, 1e-9 + 0.02 * distance.max(axis=0))
-    moving = (distance > threshold).any(axis=(1, 2))
+    distance = np.sqrt((np.nan_to_num(positions - at_rest) ** 2).sum(axis=2))
+    still = SIGMAS * np.sqrt((np.nan_to_num(noise) ** 2).sum(axis=1)) + 1e-9
+    moving = (distance > np.maximum(still, SHARE * np.quantile(distance, 0.98, axis=0))).any(axis=1)
     moving[: rest.stop] = False
-    lasting = np.convolve(moving, np.ones(LASTING), mode="full")[LASTING - 1 :] == LASTING
+    lasting = np.convolve(moving, np.ones(LASTING))[LASTING - 1 :] > LASTING - 0.5
     if not lasting.any():
         return None
     first = int(np.argmax(lasting))
-    whole = np.sqrt((distance**2).sum(axis=2)).max(axis=1)
-    roots = np.sqrt(whole[first : first + 2])
-    slope = (roots[1] - roots[0]) / (times[first + 1] - times[first])
-    guess = times[first] - roots[0] / slope if slope > 0 else times[first - 1]
-    return float(np.clip(guess, times[first - 1], times[first]))
+    near = slice(max(first - BEFORE, rest.stop - 1), first + LASTING)
+    far = distance[near][:, distance[near][-1].argmax()]
+    after = times[near]
+
+    def misfit(start: float) -> float:
+        since = np.maximum(after - start, 0.0) * (1 / (after[-1] - after[0]))
+        return nnls(np.stack([since, since**2], axis=1), far)[1]
+
+    starts = np.linspace(after[0], times[first], 20 * (first - near.start) + 1)
+    return float(min(starts, key=misfit))

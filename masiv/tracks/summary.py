@@ -59,7 +59,7 @@ def gaps(run: Run) -> dict[str, Any]:
 
 
 def _run(run: Run) -> dict[str, Any]:
-    noise = run.noise()
+    noise = run.noise
     measured = "".join(axis for axis, known in zip("xyz", run.axes.any(axis=0), strict=True) if known)
     return {
         "name": run.name,
@@ -82,7 +82,7 @@ def _run(run: Run) -> dict[str, Any]:
 
 def _travel(run: Run) -> float:
     """How far [m] the marker that moves most gets from its rest."""
-    off = np.nan_to_num(run.positions - run.rest_positions())
+    off = np.nan_to_num(run.positions - run.at_rest)
     return float(np.sqrt((off**2).sum(axis=2)).max())
 
 
@@ -156,7 +156,7 @@ def write_tracks_picture(tracks: Tracks, path: Path) -> None:
         panel.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]", title=first.name, aspect="equal")
     panels[0].legend(fontsize=7)
     for run in tracks.runs:
-        off = run.positions - run.rest_positions()
+        off = run.positions - run.at_rest
         far = 1e3 * np.sqrt(np.nansum(off**2, axis=2)).max(axis=1)
         panels[2].plot(run.times, far, lw=0.8, label=f"{run.name} ({run.purpose.replace('_', ' ')})")
         if run.release is not None:

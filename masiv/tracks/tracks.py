@@ -46,8 +46,10 @@ class Run:
     """One recording of one body. World axes, metres, seconds.
 
     positions (T, M, 3), NaN where nothing was measured; times (T,) as in the file, increasing; rate [Hz]; purpose: fit
-    or hold_out; rest: frames at rest before the release; release [s]: when the body is let go (None: not known);
-    placement: the body's own axes -> world at rest (None: no geometry, or its marker was never seen).
+    or hold_out; rest: frames at rest before the release; at_rest (M, 3): where markers are then (in the first frame
+    that shows them, without rest frames), NaN for what was not measured; noise (M, 3): standard deviation of each axis
+    at rest (None: without two rest frames); release [s]: when the body is let go (None: not known); placement: the
+    body's own axes -> world at rest (None: no geometry).
     """
 
     name: str
@@ -59,6 +61,8 @@ class Run:
     positions: np.ndarray
     rate: float
     rest: slice | None
+    at_rest: np.ndarray
+    noise: np.ndarray | None
     release: float | None
     placement: Placement | None
 
@@ -72,26 +76,8 @@ class Run:
         """Frames where a marker has all of its axes, (T, M) bool."""
         return (np.isfinite(self.positions) | ~self.axes).all(axis=2) & self.axes.any(axis=1)
 
-    def rest_positions(self) -> np.ndarray:
-        """Where markers are at rest, (M, 3) [m]: the mean of the rest frames, or the first frame where each was seen.
-        NaN for an axis that was not measured in them."""
-        if self.rest is not None:
-            return _mean(self.positions[self.rest])
-        first = np.argmax(np.isfinite(self.positions), axis=0)
-        return np.take_along_axis(self.positions, first[None], axis=0)[0]
-
-    def noise(self) -> np.ndarray | None:
-        """Standard deviation of each axis in the rest frames, (M, 3) [m]; None without two rest frames."""
-        if self.rest is None or self.rest.stop - self.rest.start < 2:
-            return None
-        at_rest = self.positions[self.rest]
-        known = np.isfinite(at_rest)
-        count = known.sum(0)
-        off = np.where(known, at_rest - _mean(at_rest), 0.0)
-        return np.sqrt(np.where(count > 1, (off**2).sum(0) / np.maximum(count - 1, 1), np.nan))
-
     def between(self, start: float, stop: float) -> Run:
-        """The frames from ``start`` to ``stop`` [s]; rest frames and release stay where they fall within it."""
+        """The frames from ``start`` to ``stop`` [s]; what is known of rest and release stays."""
         inside = np.flatnonzero((self.times >= start) & (self.times <= stop))
         if len(inside) < 2:
             raise InputError(f"run {self.name} has fewer than two frames from {start:g} to {stop:g} s: widen them")
@@ -102,8 +88,13 @@ class Run:
         return replace(self, times=self.times[first:last], positions=self.positions[first:last], rest=rest)
 
     def moving(self) -> Run:
-        """The frames from the release on; all of them where it is not known. The placement stays."""
+        """The frames from the release on; all of them where it is not known."""
         return self if self.release is None else self.between(self.release, np.inf)
+
+    @property
+    def elapsed(self) -> np.ndarray:
+        """Times (T,) [s] since the release, or since the first frame where it is not known."""
+        return self.times - (self.times[0] if self.release is None else self.release)
 
     def marker(self, name: str) -> int:
         """The index of a marker. Raises InputError for an unknown one."""
@@ -140,8 +131,15 @@ class Tracks:
         return {name: tuple(b for b in self.bodies.values() if b.group == name) for name in names}
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the first axis of what is finite; NaN where nothing is."""
-    known = np.isfinite(values)
+def rest_of(positions: np.ndarray, rest: slice | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """``at_rest`` and ``noise`` of a ``Run`` with positions (T, M, 3) [m]."""
+    if rest is None:
+        first = np.argmax(np.isfinite(positions), axis=0)
+        return np.take_along_axis(positions, first[None], axis=0)[0], None
+    known = np.isfinite(positions[rest])
     count = known.sum(0)
-    return np.where(count > 0, np.where(known, values, 0.0).sum(0) / np.maximum(count, 1), np.nan)
+    total = np.where(known, positions[rest], 0.0).sum(0)
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    off = np.where(known, positions[rest] - mean, 0.0)
+    noise = np.sqrt(np.where(count > 1, (off**2).sum(0) / np.maximum(count - 1, 1), np.nan))
+    return mean, noise if count.max(initial=0) > 1 else None
