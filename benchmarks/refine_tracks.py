@@ -102,6 +102,7 @@ def refined(case, particles, laws):
         "true": {k: v for k, v in case.effects.items()},
         "laws": [f.model.family.kind for f in fits],
         "noise_mm": noise,
+        "grid_mm": [outcome.floor.fit, outcome.floor.held_out],
         "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
         "trials": [
             (t.fitted.model.family.kind, t.candidate.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.reasons)

@@ -18,9 +18,11 @@ class RefineConfig(BaseModel):
     baseline_rollouts: int = Field(45, ge=2, description="rollouts of each stage of a law's fit without effects")
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
-    above_noise: float = Field(1.3, ge=1, description="residual over the noise floor below which nothing is looked for")
+    above_noise: float = Field(
+        1.2, ge=1, description="residual over the floor of noise and grid below which nothing is looked for"
+    )
     unexplained: float = Field(
-        4.0, ge=1, description="residual over the noise floor from which it is called unexplained, not nothing"
+        3.0, ge=1, description="residual over the same floor from which it is called unexplained, not nothing"
     )
     least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")
     least_gain: float = Field(0.15, ge=0, le=1, description="share of the held-out error that an effect must remove")

@@ -12,6 +12,7 @@ from masiv.effects.library import effect_named
 from masiv.errors import MasivError
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Simulation, effect_parameters, parameters
+from masiv.refine.noise import Floor, floor_of
 from masiv.refine.refit import Fitted, chord_fit, column, full_fit, softness, summarised
 from masiv.refine.score import Candidate, alike, score
 
@@ -53,6 +54,7 @@ class Outcome:
     after: Fitted
     rounds: list[Round]
     soft: float
+    floor: Floor
 
 
 def close_loop(
@@ -63,16 +65,17 @@ def close_loop(
     soft = softness(min(baselines, key=lambda f: f.cost).residual)
     rivals = ordered([again(simulation, f, soft) for f in baselines])[: config.families]
     before = rivals[0]
+    floor = floor_of(noise_mm, simulation, before)
     rounds: list[Round] = []
     current = before
-    while len(rounds) < config.max_effects and current.fit_mm > config.above_noise * noise_mm:
-        done = _round(simulation, current, rivals, soft, config, say)
+    while len(rounds) < config.max_effects and current.fit_mm > config.above_noise * floor.total:
+        done = _round(simulation, current, rivals, soft, floor, config, say)
         rounds.append(done)
         if done.accepted is None:
             break
         current = done.accepted.fitted
         rivals = [current]
-    return Outcome(before, current, rounds, soft)
+    return Outcome(before, current, rounds, soft, floor)
 
 
 def ordered(fits: Sequence[Fitted]) -> list[Fitted]:
@@ -89,7 +92,13 @@ def again(simulation: Simulation, fitted: Fitted, soft: float) -> Fitted:
 
 
 def _round(
-    simulation: Simulation, current: Fitted, bases: Sequence[Fitted], soft: float, config: RefineConfig, say: Say
+    simulation: Simulation,
+    current: Fitted,
+    bases: Sequence[Fitted],
+    soft: float,
+    floor: Floor,
+    config: RefineConfig,
+    say: Say,
 ) -> Round:
     trials: list[Trial] = []
     ranking: list[Candidate] = []
@@ -114,7 +123,7 @@ def _round(
     confusable = _confusable(ranking, trials, config.confusable)
     accepted = None
     for trial in trials:
-        trial.reasons = objections(current, trial.fitted, trial.candidate.effect, config)
+        trial.reasons = objections(current, trial.fitted, trial.candidate.effect, floor, config)
     for k, trial in enumerate(t for t in trials if t.passes):
         if k > 0:
             break
@@ -123,7 +132,7 @@ def _round(
             budget=2 * len(trial.fitted.parameters) + 6, soft=soft,
         )  # fmt: skip
         trial.fitted = min(final, trial.fitted, key=lambda f: f.cost)
-        trial.reasons = objections(current, trial.fitted, trial.candidate.effect, config)
+        trial.reasons = objections(current, trial.fitted, trial.candidate.effect, floor, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
 
@@ -161,14 +170,22 @@ def _assembled(first, base: Fitted, candidate: Candidate, strengths: list[str]) 
     return np.stack([known[p.name] for p in first], axis=1)
 
 
-def objections(before: Fitted, after: Fitted, effect: str, config: RefineConfig) -> list[str]:
+def objections(before: Fitted, after: Fitted, effect: str, floor: Floor, config: RefineConfig) -> list[str]:
     """Why ``effect`` is not accepted; empty where it is."""
     out = []
+    removed = math.sqrt(max(before.fit_mm**2 - after.fit_mm**2, 0.0))
+    if removed < floor.fit:
+        out.append(f"it explains {removed:.1f} mm, and a finer grid alone would change {floor.fit:.1f} mm")
     gain = before.bic(after.samples) - after.bic(after.samples)
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
     if before.held_out_mm is not None and after.held_out_mm is not None:
         share = 1 - after.held_out_mm / before.held_out_mm
+        removed = math.sqrt(max(before.held_out_mm**2 - after.held_out_mm**2, 0.0))
+        if removed < floor.held_out:
+            out.append(
+                f"it explains {removed:.1f} mm held out, and a finer grid alone would change {floor.held_out:.1f} mm"
+            )
         if share < config.least_gain:
             out.append(
                 f"it removes {100 * share:.0f} % of the held-out error, less than {100 * config.least_gain:.0f} %"

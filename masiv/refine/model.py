@@ -20,13 +20,15 @@ from masiv.identify.problem import Motion, Problem
 class Experiment:
     """One throw: rollouts of the body against its observed motion, of which frames 1…fitted-1 may be fitted.
 
-    motion: of ``problem``'s start, simulation frame.
+    motion: of ``problem``'s start, simulation frame. fine: the same with all particles, of which those of ``problem``
+    are some.
     """
 
     name: str
     problem: Problem
     fitted: int
     motion: Motion
+    fine: Problem | None = None
 
     @property
     def rows(self) -> int:
@@ -81,14 +83,21 @@ def active(model: Model, values: Mapping[str, float], problem: Problem) -> Activ
     return ActiveEffects(members, problem.setting())
 
 
+def _run(
+    problem: Problem, experiment: Experiment, model: Model, values: Mapping[str, float], frames: int, steps: int | None
+) -> torch.Tensor:
+    law, throw = law_of(model.family, dict(values)), throw_of(values, experiment)
+    return problem.run(law, throw, model.contact, frames, steps, active(model, values, problem))
+
+
 class Simulation:
-    """Residuals of models. The number of substeps is that of the first law, as in ``masiv.identify.families``."""
+    """Residuals of models. The number of substeps is held for a family, as in ``masiv.identify.families``."""
 
     STABLE = 1.4
 
     def __init__(self, experiments: Sequence[Experiment]) -> None:
         self.experiments = tuple(experiments)
-        self.steps = [0] * len(self.experiments)
+        self.steps: dict[tuple[int, str], int] = {}
         self.rollouts = 0
 
     @torch.no_grad()
@@ -98,20 +107,12 @@ class Simulation:
         problem = experiment.problem
         law = law_of(model.family, dict(values))
         try:
-            if self.steps[index] == 0:
-                self.steps[index] = problem.substeps(law)
+            steps = self.steps.setdefault((index, model.family.kind), problem.substeps(law))
             needed = problem.least_substeps(law)
-            if needed > self.STABLE * self.steps[index]:
-                raise NonFiniteError(0, 0, f"the law needs {needed} substeps a frame, {self.steps[index]} are taken")
+            if needed > self.STABLE * steps:
+                raise NonFiniteError(0, 0, f"the law needs {needed} substeps a frame, {steps} are taken")
             self.rollouts += 1
-            return problem.run(
-                law,
-                throw_of(values, experiment),
-                model.contact,
-                frames,
-                self.steps[index],
-                active(model, values, problem),
-            )
+            return _run(problem, experiment, model, values, frames, steps)
         except (InputError, NonFiniteError):
             raise
         except MasivError as failed:
@@ -129,3 +130,14 @@ class Simulation:
     def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """The fitted instants of all experiments, flat."""
         return np.concatenate([f.ravel() for f in self.fields(model, values)])
+
+    @torch.no_grad()
+    def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
+        """What all particles on their finer grid change: (K, N, 3) [m] of the particles of experiment ``index`` over
+        all frames, or None where there are no more particles. Raises NonFiniteError."""
+        experiment = self.experiments[index]
+        if experiment.fine is None or experiment.fine.count <= experiment.problem.count:
+            return None
+        frames = experiment.problem.frames
+        fine = _run(experiment.fine, experiment, model, values, frames, None)[:, experiment.problem.chosen]
+        return (fine - self.positions(model, values, index, frames)).double().numpy()

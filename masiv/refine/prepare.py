@@ -33,6 +33,7 @@ def experiment_of(
     settings = identify.model_copy(update={"samples_per_frame": config.samples_per_frame})
     few = Problem(scene, fitted, settings, simulator, particles=config.particles, seed=seed)
     fewer = Problem(scene, fitted, settings, simulator, particles=config.search_particles, seed=seed)
+    fine = Problem(scene, whole, settings, simulator)
     problem = Problem(scene, whole, settings, simulator, particles=config.particles, seed=seed)
     problem.targets[: len(few.targets)] = few.targets
     problem.start = few.start
@@ -42,4 +43,4 @@ def experiment_of(
         torch.as_tensor(few.axes.vectors_to_simulation(launch.omega), dtype=torch.float32),
         torch.zeros(()),
     )
-    return Experiment(name, problem, len(fitted.times), motion), few, fewer, launch
+    return Experiment(name, problem, len(fitted.times), motion, fine), few, fewer, launch

@@ -23,7 +23,7 @@ def verdict(found: Refined, config: RefineConfig) -> str:
     outcome = found.outcome
     if outcome.after.model.effects:
         return ADDED
-    return UNEXPLAINED if outcome.after.fit_mm > config.unexplained * found.noise_mm else NOTHING
+    return UNEXPLAINED if outcome.after.fit_mm > config.unexplained * outcome.floor.total else NOTHING
 
 
 def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str, Any]:
@@ -34,6 +34,7 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
     return {
         "schema": 1,
         "noise_floor_mm": found.noise_mm,
+        "grid_floor_mm": {"fit": outcome.floor.fit, "held_out": outcome.floor.held_out},
         "residual_mm": {"fit": outcome.before.fit_mm, "held_out": outcome.before.held_out_mm},
         "candidates": [_candidate(c, first) for c in first.candidates] if first else [],
         "accepted": [_accepted(name, outcome.after) for name in outcome.after.model.effects],
@@ -144,7 +145,8 @@ def text(document: dict[str, Any]) -> str:
     """The document for a terminal."""
     before, after = document["before"], document["after"]
     lines = [
-        f"noise floor {document['noise_floor_mm']:.1f} mm, residual {document['residual_mm']['fit']:.1f} mm fitted"
+        f"noise floor {document['noise_floor_mm']:.1f} mm, a finer grid would change "
+        f"{document['grid_floor_mm']['fit']:.1f} mm; residual {document['residual_mm']['fit']:.1f} mm fitted"
         + _held(document["residual_mm"]["held_out"])
     ]
     for c in document["candidates"][:6]:

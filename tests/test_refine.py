@@ -1,0 +1,121 @@
+"""Refine on simulated throws: the effect that was not declared must be named, measured and confirmed; a control must
+come back as nothing missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from masiv.effects.active import ActiveEffects
+from masiv.effects.effect import Setting
+from masiv.effects.library import effect_named
+from masiv.identify.config import IdentifyConfig
+from masiv.identify.parametric import Parameter
+from masiv.materials.classical import ClassicalLaw
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.rollout import rollout
+from masiv.mpm.simulate import thrown
+from masiv.mpm.simulator import Simulator
+from masiv.refine.config import RefineConfig
+from masiv.refine.noise import noise_floor_mm
+from masiv.refine.observed import SampledMotion
+from masiv.refine.refit import moved
+from masiv.refine.stage import Throw, refine, split_frames
+from masiv.refine.summary import summary
+from masiv.scene.scene import Ground, Scene
+
+pytestmark = pytest.mark.usefixtures("taichi")
+FPS, FRAMES, FITTED = 24.0, 14, 10
+SIDE, COUNT = 0.3, 512
+VELOCITY, OMEGA = (1.5, 0.5, 0.4), (1.0, 2.0, -3.0)
+
+
+def no_pictures(view, frame):
+    raise AssertionError("tracks have no pictures")
+
+
+def scene():
+    return Scene(path=Path("tracks"), layout="tracks", fps=FPS, frame_count=FRAMES, cameras=(),
+                 gravity=np.array([0.0, -9.8, 0.0]), up=np.array([0.0, 1.0, 0.0]),
+                 ground=Ground(np.array([0.0, 1.0, 0.0]), 0.0), density=1000.0, load=no_pictures,
+                 mask_source="none")  # fmt: skip
+
+
+def observed(effects, noise_m=3e-4):
+    """The motion of a cube that is thrown and lands, with ``effects`` {name: parameters} at work."""
+    side = round(COUNT ** (1 / 3))
+    axis = (torch.arange(side) + 0.5) / side * SIDE
+    start = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.0, 0.45, 0.0])
+    steps = 48
+    simulator = Simulator(particle_count=COUNT, spacing=(6 * SIDE**3 / COUNT) ** (1 / 3), substep=1 / (FPS * steps),
+                          volume=SIDE**3, density=1000.0, gravity=(0.0, -9.8, 0.0), max_substeps=512)  # fmt: skip
+    setting = Setting(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * SIDE**3 / COUNT, SIDE, FRAMES / FPS)
+    members = tuple((effect_named(name), torch.tensor(values)) for name, values in effects.items())
+    law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
+    outputs = [k * steps for k in range(1, FRAMES)]
+    with torch.no_grad():
+        path = rollout(simulator, law, thrown(start, torch.tensor(VELOCITY), torch.tensor(OMEGA)), outputs[-1],
+                       outputs, ActiveEffects(members, setting) if members else None)  # fmt: skip
+    positions = np.concatenate([start[None].numpy(), path.numpy()]).astype(np.float64)
+    positions[1:] += np.random.default_rng(0).normal(0, noise_m, positions[1:].shape)
+    return SampledMotion(positions, np.arange(FRAMES) / FPS, SIDE**3)
+
+
+def found(effects):
+    config = RefineConfig.model_validate(
+        {"particles": COUNT, "laws": ["neo_hookean"], "shortlist": 3, "samples_per_frame": 1, "max_effects": 2}
+    )
+    motion = observed(effects)
+    throw = Throw("run", scene(), SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume),
+                  motion, FITTED)  # fmt: skip
+    refined = refine(
+        [throw], IdentifyConfig.model_validate({"contact": "sticky"}), SimulatorConfig.model_validate({}), config
+    )
+    return refined, summary(refined, config, dry_run=False)
+
+
+def test_undeclared_drag_is_named_measured_and_confirmed():
+    refined, document = found({"linear_drag": [1.0]})
+    assert document["verdict"] == "effect added"
+    assert [a["effect"] for a in document["accepted"]] == ["linear_drag"]
+    assert document["accepted"][0]["theta"]["rate"] == pytest.approx(1.0, rel=0.1)
+    assert (
+        document["after"]["held_out"]["trajectory_rmse_mm"] < document["before"]["held_out"]["trajectory_rmse_mm"] / 3
+    )
+    assert document["candidates"][0]["explained"] > 0.5
+    assert refined.outcome.after.values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
+
+
+def test_nothing_is_missing_where_nothing_is():
+    _, document = found({})
+    assert document["verdict"] == "nothing missing"
+    assert document["accepted"] == []
+    assert document["before"] == document["after"]
+
+
+def test_noise_of_a_rigid_flight_is_found_whatever_the_flight():
+    random = np.random.default_rng(1)
+    body = random.uniform(-0.2, 0.2, (400, 3))
+    path = []
+    for k in range(8):
+        c, s = np.cos(0.3 * k), np.sin(0.3 * k)
+        turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        path.append(body @ turn.T + [0.1 * k**1.5, -0.02 * k**2, 0.3 * np.sin(k)])
+    noisy = np.array(path)
+    noisy[1:] += random.normal(0, 2e-3, noisy[1:].shape)
+    assert noise_floor_mm(noisy, 7) == pytest.approx(2 * np.sqrt(3), rel=0.05)
+
+
+def test_held_out_frames_are_the_runs_own_or_the_last_quarter():
+    assert split_frames(16, 12) == 12
+    assert split_frames(16, 16) == 12
+    assert split_frames(5, 5) == 4
+
+
+def test_steps_stay_within_bounds_and_keep_what_is_not_fitted():
+    rate = Parameter("linear_drag.rate", 0.1, 0.0, 20.0, 0.05)
+    out = moved([rate], {"linear_drag.rate": 0.1, "velocity_x@run": 2.0}, np.array([-5.0]))
+    assert out == {"linear_drag.rate": 0.0, "velocity_x@run": 2.0}
