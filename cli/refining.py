@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -20,6 +21,7 @@ from . import stages
 if TYPE_CHECKING:
     from masiv.refine.config import RefineConfig
     from masiv.refine.stage import Refined, Throw
+    from masiv.splat.dynamic import DynamicGaussians
     from masiv.twin import Twin
 
 BEFORE = "twin.before.yaml"
@@ -53,11 +55,10 @@ def save(
     dry_run: bool,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Write refine.json and refine.npz, and where an effect was accepted the new twin, its rollout and the report."""
+    """Write refine.json, refine.npz and the report, and where an effect was accepted the new twin and what it gives."""
     from masiv.mpm.simulate import simulate
     from masiv.refine.stage import twin_of
     from masiv.refine.summary import summary
-    from masiv.report.material import MATERIAL
 
     document = summary(found, config, dry_run=dry_run)
     new = twin_of(found.outcome.after, throw, found.simulation, twin)
@@ -73,14 +74,47 @@ def save(
     _save_fields(run.path / "refine.npz", found)
     if document["accepted"] and not dry_run:
         _keep_old(run.path)
+        _forget(run)
         new.save(run.path)
-        (run.path / MATERIAL).unlink(missing_ok=True)
         _save_rollout(run, rollouts["after"], scene)
     elif (run.path / BEFORE).is_file() and not dry_run:
+        _forget(run)
         twin.save(run.path)  # an earlier refine had accepted something that this one does not
         (run.path / BEFORE).unlink()
     write_json(run.path / "refine.json", document)
+    _report(run, scene, dynamic, progress)
     return document
+
+
+def _forget(run: RunFolder) -> None:
+    """Delete what is told of a twin that is about to change: a run that is killed then tells nothing old."""
+    from masiv.report.material import MATERIAL
+
+    for path in (run.rollout, run.metrics, run.path / MATERIAL):
+        path.unlink(missing_ok=True)
+
+
+def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: Progress) -> None:
+    """Write report.html, and before it what the run lacks of rollout, material.json and metrics.json."""
+    from masiv.mpm.simulate import simulate
+    from masiv.report.material import MATERIAL
+    from masiv.report.numbers import run_numbers
+    from masiv.report.report import write_report
+    from masiv.runfolder import load_motion
+    from masiv.twin import Twin
+
+    progress("report", 0, 1)
+    twin, trajectory = Twin.load(run.path), stages.load_trajectory(run)
+    if not run.rollout.is_file():
+        simulate(twin, frames=scene.frame_count, fps=scene.fps, progress=progress).save(run.rollout)
+    rollout, _ = load_motion(run.rollout)
+    if not (run.path / MATERIAL).is_file():
+        stages.describe(run, twin, progress)
+    if not run.metrics.is_file():
+        write_json(run.metrics, run_numbers(run, scene, dynamic, trajectory, rollout))
+    numbers = json.loads(run.metrics.read_text(encoding="utf-8"))
+    write_report(run, scene, dynamic, trajectory, twin, rollout, numbers)
+    progress("report", 1, 1)
 
 
 def _pictures(scene: Scene, dynamic, positions: np.ndarray, throw: Throw, progress: Progress) -> dict[str, dict]:

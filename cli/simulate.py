@@ -39,6 +39,10 @@ def simulate(
     force_until: Annotated[
         float | None, typer.Option("--force-until", help="When it ends [s]. [default: never]")
     ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option("--without", metavar="EFFECT", help="Leave out an effect of the twin; may be repeated."),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Where to write. [default: RUN/simulate]")] = None,
     render: Annotated[bool, typer.Option("--render", help="Also draw views/*.png and video.mp4.")] = False,
     view: Annotated[
@@ -61,11 +65,7 @@ def simulate(
     from . import stages
     from .console import progress_bar
 
-    given = {
-        "velocity": vector(velocity, "--velocity"),
-        "omega": vector(omega, "--omega"),
-        "gravity": vector(gravity, "--gravity"),
-    }
+    thrown = vector(velocity, "--velocity"), vector(omega, "--omega"), vector(gravity, "--gravity")
     folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
     folder.require("identify")
     views = view or [0]
@@ -82,6 +82,8 @@ def simulate(
     stages.start(settings)
     from masiv.mpm.simulate import Push
     from masiv.mpm.simulate import simulate as roll
+    from masiv.mpm.twin_effects import body_mass
+    from masiv.mpm.variation import without_effects
     from masiv.report.film import film
 
     push = None
@@ -89,8 +91,12 @@ def simulate(
         until = float("inf") if force_until is None else force_until
         push = Push(strength, 0.0 if force_from is None else force_from, until)
     twin, look = stages.varied(folder, law=law, blend=blend, geometry=geometry, density=density, ground=ground)
+    twin = without_effects(twin, tuple(without or ()))
     with progress_bar() as progress:
-        motion = roll(twin, frames=frames, fps=scene.fps, push=push, progress=progress, **given)
+        motion = roll(
+            twin, frames=frames, fps=scene.fps, velocity=thrown[0], omega=thrown[1], gravity=thrown[2], push=push,
+            progress=progress,
+        )  # fmt: skip
         target.mkdir(parents=True, exist_ok=True)
         motion.save(target / "rollout.npz")
         if render:
@@ -100,8 +106,9 @@ def simulate(
         "rollout": str(target / "rollout.npz"),
         "frames": frames,
         "particles": motion.positions.shape[1],
-        "mass_kg": float(twin.density * twin.volume),
+        "mass_kg": body_mass(twin),
         "law": twin.law.description(),
+        "effects": [effect.name for effect in twin.effects],
     }
     if render:
         data["video"] = str(target / "video.mp4")

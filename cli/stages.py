@@ -168,7 +168,7 @@ def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress)
     if run.done("identify"):
         twin = Twin.load(run.path)
         if not (run.path / MATERIAL).is_file():
-            _describe(run, twin, progress)
+            describe(run, twin, progress)
         return twin
     trajectory = estimated(run, config, scene, progress)
     with run.stage("identify") as checkpoint:
@@ -182,13 +182,16 @@ def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress)
             progress=logged(progress, run.log),
         )
         twin.save(run.path)
-        _describe(run, twin, progress)
+        describe(run, twin, progress)
     return twin
 
 
-def _describe(run: RunFolder, twin: Twin, progress: Progress) -> None:
+def describe(run: RunFolder, twin: Twin, progress: Progress) -> None:
+    """Write material.json: what the law of ``twin`` is in a tester's terms."""
     from masiv.materials.describe import describe_twin
 
+    if "refined" in twin.fit:  # what else is known of a fit is of the law before: the error is measured
+        twin = replace(twin, fit={})
     positions = load_trajectory(run).positions
     describe_twin(twin, frames=run.fit_frames, trajectory=positions, progress=progress).save(run.path / MATERIAL)
 

@@ -106,8 +106,10 @@ def test_substeps_and_gradients_equal_the_twin(law, contact):
     def twin(state):
         c = sim.constants
         for _ in range(steps):
-            state = _substep(state, law, mass=float(sim.mass[0]), volume=c["volume"], spacing=sim.spacing, substep=sim.substep,
-                             gravity=c["gravity"], contact=contact)  # fmt: skip
+            state = _substep(
+                state, law, mass=float(sim.mass[0]), volume=c["volume"], spacing=sim.spacing, substep=sim.substep,
+                gravity=c["gravity"], contact=contact,
+            )  # fmt: skip
         return state.position
 
     fast = loss_and_gradients(lambda state: rollout(sim, law, state, steps, [steps])[0])

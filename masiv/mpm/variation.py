@@ -1,4 +1,8 @@
-"""A twin changed into one that was never filmed: another body, density or ground."""
+"""A twin changed into one that was never filmed: another body, density or ground, fewer effects.
+
+Effects stay. Their accelerations are those of any mass, their places stay where they are in the world: under another
+body the same place is another part of it, and lowering the ground leaves them at their height.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,16 @@ from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame
 
 if TYPE_CHECKING:
-    from masiv.twin import Twin
+    from masiv.twin import Twin, TwinEffect
+
+
+def without_effects(twin: Twin, names: tuple[str, ...]) -> Twin:
+    """``twin`` without the effects of these names. Raises InputError for one that it does not have."""
+    present = [effect.name for effect in twin.effects]
+    for name in names:
+        if name not in present:
+            raise InputError(f"--without {name}: the effects that act on this twin are {', '.join(present) or 'none'}")
+    return replace(twin, effects=tuple(effect for effect in twin.effects if effect.name not in names))
 
 
 def with_density(twin: Twin, density: float) -> Twin:
@@ -28,21 +41,26 @@ def with_density(twin: Twin, density: float) -> Twin:
 def with_ground(twin: Twin, ground: str) -> Twin:
     """``twin`` over another ground: 'none', or a height [m] along the ground's normal (up, where it had no ground).
 
-    Raises InputError for anything else, and for a ground that the body would stand in.
+    It is where it is put: an effect that raises the ground is left out. Raises InputError for anything else, and for a
+    ground that the body would stand in.
     """
+    normal = _up(twin)
+    before = 0.0 if twin.ground is None else twin.ground.height
     if ground.strip().lower() == "none":
-        return replace(twin, ground=None, contact="none")
+        # The normal stays the vertical of the simulation, in whose axes effects are.
+        return replace(twin, ground=None, contact="none", up=normal, effects=_over_new_ground(twin.effects, before))
     try:
         height = float(ground)
     except ValueError:
         height = math.nan
     if not math.isfinite(height):
         raise InputError(f"--ground {ground}: give 'none' or a height in metres")
-    normal = _up(twin)
     lowest = float((twin.positions.astype(np.float64) @ normal).min())
     if lowest < height - grid_spacing(twin.volume, len(twin.positions), twin.simulator):
         raise InputError(f"--ground {ground}: the body reaches down to {lowest:.3g} m, give a lower ground")
-    return replace(twin, ground=Ground(normal, height), contact="sticky" if twin.contact == "none" else twin.contact)
+    contact = "sticky" if twin.contact == "none" else twin.contact
+    effects = _over_new_ground(twin.effects, before - height)
+    return replace(twin, ground=Ground(normal, height), contact=contact, effects=effects)
 
 
 def with_body_of(twin: Twin, other: Twin) -> tuple[Twin, np.ndarray]:
@@ -77,6 +95,15 @@ def with_mesh(twin: Twin, mesh: Path) -> Twin:
 def _up(twin: Twin) -> np.ndarray:
     normal = np.asarray(twin.up if twin.ground is None else twin.ground.normal, dtype=np.float64)
     return normal / np.linalg.norm(normal)
+
+
+def _over_new_ground(effects: tuple[TwinEffect, ...], lift: float) -> tuple[TwinEffect, ...]:
+    """``effects`` over a ground that is lower by ``lift`` [m]: places (parameters x, y, z [m]) keep their height."""
+    from masiv.effects.effect import Effect
+    from masiv.effects.library import effect_named
+
+    kept = (e for e in effects if type(effect_named(e.name)).ground_shift is Effect.ground_shift)
+    return tuple(replace(e, values={**e.values, "y": e.values["y"] + lift}) if "y" in e.values else e for e in kept)
 
 
 def _place(twin: Twin, positions: np.ndarray) -> np.ndarray:

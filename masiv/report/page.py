@@ -17,8 +17,16 @@ h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.15rem;margin:2rem 0 .6rem
 table{border-collapse:collapse;margin:.5rem 0}th,td{padding:.3rem .9rem .3rem 0;text-align:left;vertical-align:top}
 th{font-weight:600;border-bottom:1px solid #9aa4b1}td{border-bottom:1px solid #e6e9ee}
 td.n{text-align:right;font-variant-numeric:tabular-nums}
-img,video{max-width:100%;height:auto}.note{color:#5b6675;font-size:.9rem}
+td.bar{min-width:9rem;white-space:nowrap}td.bar i{display:inline-block;height:.7em;margin-right:.5em;background:#2563a8}
+h3{font-size:1rem;margin:1.4rem 0 .2rem}img,video{max-width:100%;height:auto}.note{color:#5b6675;font-size:.9rem}
 """
+
+
+@dataclass(frozen=True)
+class Share:
+    """A part of a whole, 0 to 1, that a table shows as a bar."""
+
+    value: float
 
 
 @dataclass
@@ -30,6 +38,9 @@ class Page:
 
     def heading(self, text: str) -> None:
         self.parts.append(f"<h2>{html.escape(text)}</h2>")
+
+    def subheading(self, text: str) -> None:
+        self.parts.append(f"<h3>{html.escape(text)}</h3>")
 
     def note(self, text: str) -> None:
         self.parts.append(f'<p class="note">{html.escape(text)}</p>')
@@ -75,6 +86,9 @@ def number(value: Any) -> str:
 
 
 def _cell(value: Any) -> str:
+    if isinstance(value, Share):
+        width = 6 * min(max(value.value, 0.0), 1.0)
+        return f'<td class="bar"><i style="width:{width:.2f}rem"></i>{100 * value.value:.0f} %</td>'
     kind = ' class="n"' if isinstance(value, (int, float)) and not isinstance(value, bool) else ""
     return f"<td{kind}>{html.escape(number(value))}</td>"
 

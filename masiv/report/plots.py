@@ -11,17 +11,19 @@ import numpy as np
 BLUE, ORANGE, GREEN, GREY = "#2563a8", "#d97706", "#2f855a", "#8a8f98"
 
 
-def _figure(columns: int = 1) -> tuple[Any, Any]:
+def _figure(columns: int = 1, rows: int = 1, size: tuple[float, float] = (5.2, 3.2)) -> tuple[Any, Any]:
+    """A figure of panels of ``size`` [inches], and its axes: of the one row, or (rows, columns)."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, columns, figsize=(5.2 * columns, 3.2), squeeze=False, layout="constrained")
-    for axis in axes[0]:
+    whole = (size[0] * columns, size[1] * rows)
+    figure, axes = pyplot.subplots(rows, columns, figsize=whole, squeeze=False, layout="constrained")
+    for axis in axes.flat:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-    return figure, axes[0]
+    return figure, axes[0] if rows == 1 else axes
 
 
 def _png(figure: Any) -> bytes:
@@ -118,6 +120,80 @@ def material_curves(curves: Mapping[str, Mapping[str, Any]]) -> bytes:
         axis.axhline(0, color=GREY, linewidth=0.5)
     axes[0].legend(frameon=False, fontsize=8)
     return _png(figure)
+
+
+def residual_in_time(curves: Mapping[str, np.ndarray], times: np.ndarray, fitted: int, noise_mm: float) -> bytes:
+    """Residuals. curves: name -> (K, N, 3) [m] at ``times`` (K,) [s], of which the first ``fitted`` were fitted."""
+    figure, (axis,) = _figure(1, size=(7.2, 3.4))
+    half = (times[1] - times[0]) / 2 if len(times) > 1 else times[0] / 2
+    edge = times[min(fitted, len(times)) - 1] + half
+    axis.axvspan(times[0] - half, edge, color=BLUE, alpha=0.07, linewidth=0, label="fitted")
+    if fitted < len(times):
+        axis.axvspan(edge, times[-1] + half, color=ORANGE, alpha=0.12, linewidth=0, label="held out")
+    axis.axhline(noise_mm, color=GREY, linestyle="--", linewidth=1.2, label="noise floor")
+    for colour, (name, field) in zip((ORANGE, BLUE), curves.items(), strict=False):
+        rms = 1e3 * np.sqrt((field.astype(np.float64) ** 2).sum(2).mean(1))
+        axis.plot(times, rms, color=colour, label=name, marker="o", markersize=3)
+    axis.set(xlabel="time [s]", ylabel="residual, RMS over particles [mm]", xlim=(times[0] - half, times[-1] + half))
+    axis.set_ylim(bottom=0)
+    figure.legend(frameon=False, fontsize=8, loc="outside right center")
+    return _png(figure)
+
+
+ARROW_CELLS = 7
+"""Cells along the longer side of the body, over each of which an arrow is the mean."""
+
+
+def residual_in_space(
+    fields: Mapping[str, np.ndarray], positions: np.ndarray, times: np.ndarray, up: np.ndarray | None = None
+) -> bytes:
+    """Where residuals are: a row for each of ``fields`` (name -> (K, N, 3) [m]), two views of ``positions`` (N, 3) [m].
+
+    Colour: RMS over instants, one scale for all rows, the largest on top. Arrows: the mean over a cell at the row's
+    worst instant, the longest of a row as long as a cell. up (3,): the axis nearest to it is drawn upwards; y without.
+    """
+    size = {name: 1e3 * np.linalg.norm(field.astype(np.float64), axis=2) for name, field in fields.items()}
+    colour = {name: np.sqrt((found**2).mean(0)) for name, found in size.items()}
+    top = max(float(np.quantile(found, 0.99)) for found in colour.values())
+    upright = 1 if up is None else int(np.abs(up).argmax())
+    level = [axis for axis in range(3) if axis != upright]
+    extent = np.ptp(positions, axis=0)
+    height = 4.0 * float(extent[upright] / max(extent[level].max(), 1e-9)) + 0.9
+    figure, panels = _figure(2, len(fields), size=(4.9, min(max(height, 2.2), 6.0)))
+    shown = None
+    for row, (name, field) in zip(np.reshape(panels, (-1, 2)), fields.items(), strict=True):
+        worst = int((size[name] ** 2).mean(1).argmax())
+        means = [_cell_means(positions[:, [across, upright]], field[worst][:, [across, upright]]) for across in level]
+        longest = max(float(np.linalg.norm(arrows, axis=1).max()) for _, arrows, _ in means)
+        for axis, across, (places, arrows, cell) in zip(row, level, means, strict=True):
+            order = colour[name].argsort()
+            points = positions[order][:, [across, upright]].T
+            shown = axis.scatter(*points, c=colour[name][order], s=7, linewidths=0, cmap="viridis", vmin=0, vmax=top)
+            axis.quiver(
+                *places.T, *arrows.T, angles="xy", scale_units="xy", scale=max(longest, 1e-12) / (1.2 * cell),
+                color="white", edgecolor="#1c2430", linewidth=0.6, width=0.006, zorder=3,
+            )  # fmt: skip
+            axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[upright]} [m]", aspect="equal")
+            axis.margins(0.12)
+            axis.set_title(f"{name}; arrows at {times[worst]:.2f} s, longest {1e3 * longest:.2g} mm", fontsize=9)
+            if up is not None and up[upright] < 0:
+                axis.invert_yaxis()
+    figure.colorbar(shown, ax=panels, label="residual of a particle, RMS over time [mm]", extend="max", shrink=0.8)
+    return _png(figure)
+
+
+def _cell_means(points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Means of ``points`` (N, 2) and of ``values`` (N, 2) over square cells, and the side of a cell."""
+    low = points.min(0)
+    side = max(float(np.ptp(points, axis=0).max()) / ARROW_CELLS, 1e-9)
+    cells = np.minimum(((points - low) / side).astype(int), ARROW_CELLS - 1)
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cell = cell.ravel()
+
+    def mean(of: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(cell, of[:, k]) for k in range(2)], axis=1) / count[:, None]
+
+    return mean(points), mean(values), side
 
 
 def _mark_fit(axis: Any, where: float | None, label: str) -> None:

@@ -20,6 +20,7 @@ from masiv.report.material import material_section, read_material
 from masiv.report.media import write_video
 from masiv.report.numbers import rows
 from masiv.report.page import Page
+from masiv.report.refined import refine_section
 from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
 
@@ -61,11 +62,15 @@ def write_report(
     page.note("PSNR and SSIM: object on black. 'to trajectory' is what the fit made small, no ground truth.")
     page.heading("The twin")
     page.table(["quantity", "value", "unit"], _twin_rows(twin))
+    _effects_section(page, twin)
     material = read_material(run.path)
     if material is None:
         page.picture(plots.law_curves(twin.law), "stress of the identified law")
     else:
         material_section(page, material)
+    refined = refine_section(run.path, scene.up)
+    if refined is not None:
+        page.parts.append(refined)
     page.heading("Motion")
     fit_end = (run.fit_frames - 1) / scene.fps
     motions = {"trajectory": (trajectory.positions, trajectory.times), "twin": (rollout, scene.times)}
@@ -143,13 +148,38 @@ def _twin_rows(twin: Twin) -> list[list[Any]]:
         ["contact", twin.contact, ""],
     ]
     law = twin.law.description()
-    for group in ({"law": law.get("kind")}, law.get("parameters", {}), twin.fit):
+    fit = twin.fit if "refined" not in twin.fit else twin.fit["refined"]  # the rest is of the law before
+    for group in ({"law": law.get("kind")}, law.get("parameters", {}), fit):
         for name, value in group.items():
             if name == "history":
                 continue
             quantity, unit = (value["value"], value["unit"]) if isinstance(value, Mapping) else (value, "")
             rows.append([name.replace("_", " "), quantity, unit])
     return rows
+
+
+def _effects_section(page: Page, twin: Twin) -> None:
+    """What acts on the twin besides its law, gravity and ground."""
+    from masiv.effects.library import effect_named
+
+    if not twin.effects:
+        return
+    page.table(
+        ["effect", "looks like", "parameter", "value", "unit", "standard error"],
+        [
+            [
+                effect.name.replace("_", " "),
+                effect_named(effect.name).looks_like,
+                name.replace("_", " "),
+                value,
+                unit,
+                stderr,
+            ]
+            for effect in twin.effects
+            for name, value, unit, stderr in effect.rows()
+        ],
+    )
+    page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
 
 
 def _picture_curves(run: RunFolder, numbers: Mapping[str, Any]) -> bytes:

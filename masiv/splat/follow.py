@@ -95,7 +95,8 @@ class _Following:
         with torch.no_grad():
             self.known_changes = known.changes(means, self.known_times)
         centroids = torch.tensor(np.stack([h.points.mean(axis=0) for h in hulls]), dtype=torch.float32)
-        self.identity = repr((config.model_dump(), follow_config.model_dump(), seed, str(scene.path), self.count))
+        asked = config.model_dump(), follow_config.model_dump(), seed, str(scene.path), self.known, self.count
+        self.identity = repr((*asked, scene.views))
         resumed = state is not None and state["identity"] == self.identity
         self._begin(known, centroids, relearn=not resumed)
         if resumed and state is not None:

@@ -1,0 +1,228 @@
+"""What ``masiv refine`` found, as a section of the report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from masiv.errors import InputError
+from masiv.report import plots
+from masiv.report.page import Page, Share, number
+
+REFINED, FIELDS = "refine.json", "refine.npz"
+METRICS = {
+    "trajectory_rmse_mm": ("distance to the observed motion, RMS", "mm"),
+    "chamfer_1e3mm2": ("chamfer distance to the observed motion", "10³ mm²"),
+    "psnr_db": ("PSNR against the video", "dB"),
+    "psnr_box_in_scene_db": ("PSNR in the mask's box, background drawn", "dB"),
+    "ssim": ("SSIM against the video", ""),
+    "mask_iou": ("overlap of masks (IoU)", ""),
+}
+
+
+def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
+    """refine.json and refine.npz of the run folder, None where it lacks one. InputError: unreadable."""
+    if not (run / REFINED).is_file() or not (run / FIELDS).is_file():
+        return None
+    try:
+        document = json.loads((run / REFINED).read_text(encoding="utf-8"))
+        with np.load(run / FIELDS, allow_pickle=False) as file:
+            fields = {name: file[name] for name in ("before", "after", "positions", "times", "fitted")}
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise InputError(f"{run / REFINED} and {FIELDS} cannot be read ({error}): run masiv refine again") from error
+    if not isinstance(document, dict) or document.get("schema") != 1:
+        raise InputError(f"{run / REFINED} is of another version of masiv: run masiv refine again")
+    return document, fields
+
+
+def refine_section(run: Path, up: np.ndarray | None = None) -> str | None:
+    """HTML of the section on what ``masiv refine`` left in ``run``, None where it was not run.
+
+    up (3,): upwards in the world, for the views. Raises InputError where the files cannot be read.
+    """
+    found = read_refined(run)
+    if found is None:
+        return None
+    document, fields = found
+    page = Page("")
+    page.heading("Closing the loop: what does the model lack?")
+    page.note(_verdict(document))
+    _figures(page, document, fields, up)
+    _causes(page, document["candidates"])
+    _refits(page, document["rounds"])
+    _before_after(page, document["before"], document["after"])
+    _accepted(page, document["accepted"])
+    _unexplained(page, document["unexplained"])
+    _next_throw(page, document.get("next_experiment"))
+    return "".join(page.parts)
+
+
+def _verdict(document: Mapping[str, Any]) -> str:
+    names = ", ".join(_words(entry["effect"]) for entry in document["accepted"])
+    laws = document["laws"]
+    law = _words(laws["before"])
+    if laws["after"] != laws["before"]:
+        law += f", then {_words(laws['after'])}"
+    errors = [
+        f"{label} {_mm(document['before'], split)} → {_mm(document['after'], split)} mm"
+        for split, label in (("fit", "fitted frames"), ("held_out", "held-out frames"))
+        if document["before"].get(split)
+    ]
+    return (
+        f"Verdict: {document['verdict']}{': ' + names if names else ''}. Residual (simulated less observed) on "
+        f"{', on '.join(errors)}; noise floor of the observation {number(document['noise_floor_mm'])} mm. "
+        f"Classical law with its best parameters: {law}. {document['rollouts']} rollouts."
+    )
+
+
+def _mm(errors: Mapping[str, Any], split: str) -> str:
+    return number(errors.get(split, {}).get("trajectory_rmse_mm"))
+
+
+def _figures(page: Page, document: Mapping[str, Any], fields: Mapping[str, np.ndarray], up: np.ndarray | None) -> None:
+    added = bool(document["accepted"])
+    names = ("before", "after") if added else ("before",)
+    shown = {name if added else "without effects": fields[name] for name in names}
+    times = fields["times"]
+    page.picture(
+        plots.residual_in_time(shown, times, int(fields["fitted"]), document["noise_floor_mm"]), "residual in time"
+    )
+    page.note(
+        "What the added effect explains is the gap between the curves, also on held-out frames, which no fit saw; what "
+        "stays above the dashed line is not noise."
+        if added
+        else "A curve near the dashed line leaves nothing to explain; one that grows away from it is missing physics."
+    )
+    page.picture(plots.residual_in_space(shown, fields["positions"], times, up), "residual in space")
+    page.note(
+        "Particles at frame 0. An even colour is an error of the whole body, a bright spot one of a part; arrows point "
+        "from the observed to the simulated position."
+    )
+
+
+def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
+    page.subheading("Causes, ranked")
+    if not candidates:
+        page.note("None was looked for: the residual is too near the noise floor.")
+        return
+    page.table(
+        ["effect", "explains alone", "strength", "unit", "standard error", "looks like", "what it does in a video"],
+        [
+            [
+                _words(c["effect"]),
+                Share(c["explained"]),
+                _number(c["theta"]),
+                _unit(c["unit"]),
+                _number(c["stderr"]),
+                ", ".join(map(_words, c["confusable_with"])) or None,
+                c["looks_like"],
+            ]
+            for c in candidates
+        ],
+    )
+    page.note(
+        "Share of the residual that one effect explains, once launch, stiffness and ground have absorbed what they "
+        "can (score test, first order: a shortlist, the refits decide). Looks like: what this motion hardly tells it "
+        "from."
+    )
+
+
+def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
+    rows = []
+    for turn, done in enumerate(rounds, start=1):
+        for refit in done["refits"]:
+            values = ", ".join(f"{_words(n)} {number(_number(q['value']))}" for n, q in refit["parameters"].items())
+            outcome = "accepted" if refit["accepted"] else "; ".join(refit["objections"]) or "another was better"
+            rows.append([
+                turn, ", ".join(map(_words, [*done["base"]["effects"], refit["effect"]])), _words(refit["law"]),
+                _number(refit["fit_rmse_mm"]), _number(refit["held_out_rmse_mm"]),
+                _number(refit["information_gain"]), values, outcome,
+            ])  # fmt: skip
+    if not rows:
+        return
+    page.subheading("Refits that competed")
+    page.table(
+        ["round", "effects", "law", "fitted [mm]", "held out [mm]", "BIC falls by", "values", "accepted, or why not"],
+        rows,
+    )
+    page.note("Each was fitted through the rollout together with the law's parameters and the launch.")
+
+
+def _before_after(page: Page, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
+    page.subheading("Before and after")
+    splits = [split for split in ("fit", "held_out") if before.get(split)]
+    keys = [*METRICS, *sorted({k for s in splits for k in before[s]} - METRICS.keys() - {"frames"})]
+    rows = []
+    for key in keys:
+        cells = [_number(errors[split].get(key)) for split in splits for errors in (before, after)]
+        if any(cell is not None for cell in cells):
+            rows.append([*METRICS.get(key, (_words(key), "")), *cells])
+    labels = {"fit": "fitted", "held_out": "held out"}
+    page.table(["quantity", "unit", *(f"{labels[s]}, {when}" for s in splits for when in ("before", "after"))], rows)
+    frames = [f"{labels[s]}: {_span(before[s]['frames'])}" for s in splits if before[s].get("frames")]
+    if frames:
+        page.note(f"Frames {'; '.join(frames)}. Before: the best model without effects, not the learnt law.")
+
+
+def _span(frames: Sequence[int]) -> str:
+    return f"{frames[0]} to {frames[-1]}" if len(frames) > 1 else str(frames[0])
+
+
+def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
+    if not accepted:
+        return
+    page.subheading("What was added")
+    page.table(
+        ["effect", "parameter", "value", "standard error", "unit"],
+        [
+            [_words(a["effect"]), _words(n), _number(value), _number(a["stderr"].get(n)), _unit(a["unit"].get(n, ""))]
+            for a in accepted
+            for n, value in a["theta"].items()
+        ],
+    )
+    page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
+
+
+def _unexplained(page: Page, left: Mapping[str, Any]) -> None:
+    page.subheading("What stays unexplained")
+    page.table(
+        ["quantity", "value", "unit"],
+        [
+            ["residual over all frames, RMS", _number(left["rmse_mm"]), "mm"],
+            ["noise floor", _number(left["noise_floor_mm"]), "mm"],
+            ["worst frame", _number(left["worst_frame"]), ""],
+            ["residual there, RMS", _number(left["worst_frame_rmse_mm"]), "mm"],
+            ["middle of the worst tenth of the body, at frame 0", left["worst_place_at_frame_0_m"], "m"],
+            ["residual of that tenth, RMS", _number(left["worst_place_rmse_mm"]), "mm"],
+        ],
+    )
+
+
+def _next_throw(page: Page, proposal: Mapping[str, Any] | None) -> None:
+    if proposal is None:
+        return
+    page.subheading("The throw to film next")
+    velocity, spin = proposal["velocity"], proposal["omega"]
+    page.note(
+        f"{' and '.join(map(_words, proposal['tells_apart']))} look alike in this throw "
+        f"({number(_number(proposal['difference_in_this_throw_mm']))} mm apart). Thrown at {number(velocity['value'])} "
+        f"{velocity['unit']} with a spin of {number(spin['value'])} {spin['unit']}, they would be "
+        f"{number(_number(proposal['predicted_difference_mm']))} mm apart."
+    )
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
