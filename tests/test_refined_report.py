@@ -1,0 +1,108 @@
+"""The report's section on `masiv refine`, from refine.json and refine.npz alone."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from masiv.errors import InputError
+from masiv.report import plots
+from masiv.report.refined import refine_section
+
+ERRORS = {
+    "fit": {"frames": [0, 11], "trajectory_rmse_mm": 10.7, "chamfer_1e3mm2": 0.31},
+    "held_out": {"frames": [12, 15], "trajectory_rmse_mm": 40.2},
+}
+
+
+def document(**changes):
+    refit = {
+        "law": "neo_hookean", "effect": "linear_drag", "explained": 0.81, "fit_rmse_mm": 4.2, "held_out_rmse_mm": 13.1,
+        "parameters": {"rate": {"value": 0.72, "stderr": 0.02}}, "information_gain": 900.0, "accepted": True,
+        "objections": [],
+    }  # fmt: skip
+    refused = refit | {"effect": "swirl", "accepted": False, "objections": ["held out <gets> worse"], "parameters": {}}
+    whole = {
+        "schema": 1, "noise_floor_mm": 2.5, "grid_floor_mm": {"fit": 3.0, "held_out": 4.0},
+        "residual_mm": {"fit": 10.7, "held_out": 40.2},
+        "candidates": [
+            {"effect": "linear_drag", "explained": 0.81, "theta": 0.7, "unit": "1/s", "stderr": 0.02,
+             "parameters": {"rate": 0.7}, "confusable_with": ["quadratic_drag"], "looks_like": "slows & slows"},
+        ],
+        "accepted": [{"effect": "linear_drag", "theta": {"rate": 0.7234}, "stderr": {"rate": 0.0213},
+                      "unit": {"rate": "1/s"}}],
+        "before": ERRORS,
+        "after": {"fit": ERRORS["fit"] | {"trajectory_rmse_mm": 4.2},
+                  "held_out": ERRORS["held_out"] | {"trajectory_rmse_mm": 13.1}},
+        "unexplained": {"rmse_mm": 5.0, "noise_floor_mm": 2.5, "worst_frame": 14.5, "worst_frame_rmse_mm": 14.0,
+                        "rmse_mm_by_instant": [1.0], "worst_place_at_frame_0_m": [0.1, 0.2, 0.3],
+                        "worst_place_rmse_mm": 9.0},
+        "verdict": "effect added", "laws": {"before": "neo_hookean", "after": "neo_hookean"},
+        "rounds": [{"base": {"law": "neo_hookean", "effects": []}, "refits": [refit, refused]}],
+        "next_experiment": {
+            "tells_apart": ["linear_drag", "quadratic_drag"], "velocity": {"value": [1.5, 0.0, 0.0], "unit": "m/s"},
+            "omega": {"value": [0.0, 4.0, 0.0], "unit": "rad/s"}, "predicted_difference_mm": 61.0,
+            "difference_in_this_throw_mm": 3.0,
+        },
+        "rollouts": 88,
+    }  # fmt: skip
+    return whole | changes
+
+
+def fields(instants=16, fitted=12, particles=90):
+    generator = np.random.default_rng(0)
+    positions = generator.uniform(0, 0.3, (particles, 3)).astype(np.float32)
+    growth = np.linspace(0.001, 0.04, instants)[:, None, None]
+    before = (growth * np.array([1.0, 0.2, 0.0]) + 1e-4 * generator.normal(size=(instants, particles, 3))).astype("f4")
+    return {
+        "before": before, "after": 0.3 * before, "positions": positions,
+        "times": np.arange(1, instants + 1) / 24, "fitted": np.array(fitted),
+    }  # fmt: skip
+
+
+def write(run, found, arrays):
+    (run / "refine.json").write_text(json.dumps(found))
+    np.savez(run / "refine.npz", **arrays)
+
+
+def test_numbers_and_pictures_of_an_accepted_effect(tmp_path):
+    write(tmp_path, document(), fields())
+    section = refine_section(tmp_path, np.array([0.0, 1.0, 0.0]))
+    assert section.count("data:image/png;base64,") == 2
+    shown = ["effect added: linear drag", "0.7234", "0.0213", "81 %", "10.7 → 4.2", "40.2 → 13.1", "quadratic drag"]
+    markup = ["held out &lt;gets&gt; worse", "slows &amp; slows"]  # text is never markup
+    assert [text for text in (*shown, "61", "12 to 15", "0.31", *markup) if text not in section] == []
+
+
+def test_nothing_found(tmp_path):
+    alone = {"fit": ERRORS["fit"], "held_out": {}}
+    found = document(accepted=[], candidates=[], rounds=[], next_experiment=None, before=alone, after=alone,
+                     verdict="nothing missing")  # fmt: skip
+    write(tmp_path, found, fields(instants=12, fitted=12))
+    section = refine_section(tmp_path)
+    assert "nothing missing" in section
+    assert [text for text in ("What was added", "held out", "Refits") if text in section] == []
+
+
+def test_absent_and_unreadable(tmp_path):
+    assert refine_section(tmp_path) is None
+    write(tmp_path, document(), fields())
+    (tmp_path / "refine.npz").write_bytes(b"PK broken")
+    with pytest.raises(InputError, match="run masiv refine again"):
+        refine_section(tmp_path)
+    write(tmp_path, document(schema=2), fields())
+    with pytest.raises(InputError, match="another version"):
+        refine_section(tmp_path)
+
+
+def test_fields_of_one_instant_and_of_no_residual():
+    """Pictures hold for what a short or a perfect fit gives."""
+    one = np.zeros((1, 8, 3), dtype=np.float32)
+    points = np.random.default_rng(1).uniform(size=(8, 3))
+    for png in (
+        plots.residual_in_time({"before": one}, np.array([0.1]), 1, 1.0),
+        plots.residual_in_space({"before": one}, points, np.array([0.1])),
+    ):
+        assert png.startswith(b"\x89PNG")
