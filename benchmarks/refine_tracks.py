@@ -76,9 +76,8 @@ def refined(case, particles, laws):
     from masiv.mpm.config import SimulatorConfig
     from masiv.refine.baselines import baselines
     from masiv.refine.config import RefineConfig
-    from masiv.refine.loop import close_loop
+    from masiv.refine.loop import close_loop, excess
     from masiv.refine.model import Simulation
-    from masiv.refine.noise import noise_floor_mm
     from masiv.refine.observed import SampledMotion
     from masiv.refine.prepare import experiment_of
 
@@ -91,18 +90,18 @@ def refined(case, particles, laws):
         "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config, seed=0
     )
     simulation = Simulation([experiment])
-    noise = noise_floor_mm(cut.positions, launch.last_frame)
     began = time.time()
     fits = baselines(simulation, few, fewer, min(launch.last_frame + 2, few.frames), config, Checkpoint(None), quiet)
     middle = time.time()
-    outcome = close_loop(simulation, fits, noise, config, quiet)
+    outcome = close_loop(simulation, fits, config, quiet)
     first = outcome.rounds[0] if outcome.rounds else None
     return {
         "case": case.name,
         "true": {k: v for k, v in case.effects.items()},
         "laws": [f.model.family.kind for f in fits],
-        "noise_mm": noise,
-        "grid_mm": [outcome.floor.fit, outcome.floor.held_out],
+        "noise_mm": 1e3 * experiment.noise,
+        "excess": [excess(outcome.before, simulation.experiments), excess(outcome.after, simulation.experiments)],
+        "sigma_mm": (1e3 * simulation.experiments[0].sigma).round(1).tolist(),
         "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
         "trials": [
             (t.fitted.model.family.kind, t.candidate.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.reasons)

@@ -54,6 +54,8 @@ class Effect(ABC):
     on_grid: ClassVar[str | None] = None
     """``nodes``: ``node_velocity`` acts everywhere, before contact; ``ground``: it is the contact with the ground."""
     on_stress: ClassVar[bool] = False
+    cause: ClassVar[bool] = True
+    """False for a stop-gap, which no search may name."""
 
     def node_velocity(self) -> Callable[..., Any]:
         """Taichi function (x, v, held, t, dt, dx, c) -> v, see ``masiv.kernels.effects.NodeKernels``."""

@@ -19,7 +19,7 @@ class RefineConfig(BaseModel):
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
     above_noise: float = Field(
-        1.2, ge=1, description="residual over the floor of noise and grid below which nothing is looked for"
+        1.2, ge=0, description="residual over what noise and grid explain, below which nothing is looked for"
     )
     unexplained: float = Field(
         3.0, ge=1, description="residual over the same floor from which it is called unexplained, not nothing"

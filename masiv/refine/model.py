@@ -20,15 +20,23 @@ from masiv.identify.problem import Motion, Problem
 class Experiment:
     """One throw: rollouts of the body against its observed motion, of which frames 1…fitted-1 may be fitted.
 
-    motion: of ``problem``'s start, simulation frame. fine: the same with all particles, of which those of ``problem``
-    are some.
+    motion: of ``problem``'s start, simulation frame. fine: the same on a finer grid with all particles, of which those
+    of ``problem`` are some. noise: of the observation [m]. sigma (K,): by how much model and observation may differ at
+    each instant [m] with nothing missing; the noise while the rest is not known.
     """
 
     name: str
     problem: Problem
     fitted: int
     motion: Motion
-    fine: Problem | None = None
+    fine: Problem | None
+    noise: float
+    sigma: np.ndarray
+
+    def weighted(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, N, 3) [m] from the first instant on, in proportion to what it says: as it is where sigma is
+        the noise, less where the model itself is less certain."""
+        return field * (self.noise / self.sigma[: len(field), None, None])
 
     @property
     def rows(self) -> int:
@@ -128,15 +136,16 @@ class Simulation:
         return out
 
     def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
-        """The fitted instants of all experiments, flat."""
-        return np.concatenate([f.ravel() for f in self.fields(model, values)])
+        """The fitted instants of all experiments, weighted, flat."""
+        found = zip(self.experiments, self.fields(model, values), strict=True)
+        return np.concatenate([e.weighted(f).ravel() for e, f in found])
 
     @torch.no_grad()
     def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
-        """What all particles on their finer grid change: (K, N, 3) [m] of the particles of experiment ``index`` over
-        all frames, or None where there are no more particles. Raises NonFiniteError."""
+        """What a finer grid with more particles changes: (K, N, 3) [m] of the particles of experiment ``index`` over
+        all frames, or None where there is none. Raises NonFiniteError."""
         experiment = self.experiments[index]
-        if experiment.fine is None or experiment.fine.count <= experiment.problem.count:
+        if experiment.fine is None:
             return None
         frames = experiment.problem.frames
         fine = _run(experiment.fine, experiment, model, values, frames, None)[:, experiment.problem.chosen]

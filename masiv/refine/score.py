@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from masiv.effects.effect import Effect
-from masiv.effects.library import effects
+from masiv.effects.library import causes, effects
 from masiv.errors import NonFiniteError
 from masiv.identify.parametric import robust_weight
 from masiv.refine.model import Simulation, effect_parameters
@@ -41,7 +41,7 @@ def score(
     names: list[str] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Candidate]:
-    """Every effect that ``base`` lacks, best explained first. names: only these."""
+    """Every cause that ``base`` lacks, best explained first. names: only these, of all effects."""
     weight = robust_weight(base.residual, soft)
     nuisance = _basis(base.jacobian * weight[:, None])
     left = _without(nuisance, base.residual * weight)
@@ -49,7 +49,7 @@ def score(
     setting = simulation.experiments[0].problem.setting()
     on_ground = any(library[n].on_grid == "ground" for n in base.model.effects)
     found = []
-    todo = [n for n in (names or library) if n not in base.model.effects]
+    todo = [n for n in (names or causes()) if n not in base.model.effects]
     for done, name in enumerate(todo):
         if progress is not None:
             progress(name, done, len(todo))
