@@ -26,6 +26,11 @@ class RefineConfig(BaseModel):
     )
     least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")
     least_gain: float = Field(0.15, ge=0, le=1, description="share of the held-out error that an effect must remove")
+    decisive: float = Field(
+        4.0, ge=1,
+        description="variance that an effect must explain, over the noise's, in the phase where the simulation is as "
+        "certain as the observation, to be accepted although held-out frames are too uncertain to tell",
+    )  # fmt: skip
     least_bic: float = Field(10.0, ge=0, description="how far an effect must lower the information criterion")
     least_sigmas: float = Field(4.0, ge=0, description="standard errors that a strength must lie from zero")
     confusable: float = Field(0.95, gt=0, le=1, description="correlation from which two effects look alike")
