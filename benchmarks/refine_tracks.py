@@ -42,6 +42,12 @@ STRENGTHS = {
     "time_offset": [{"delay": 0.02}, {"delay": -0.015}],
 }  # fmt: skip
 
+OUTSIDE = {
+    "attraction": {"strength": 0.5, "x": 0.6, "y": 0.7, "z": 0.5},
+    "gust": {"acceleration": 20.0, "begin": 0.1, "end": 0.2},
+    "swelling": {"pressure": 4000.0},
+}
+
 
 def cases():
     """Every effect at its strengths in one material each in turn, and controls of every material."""
@@ -64,6 +70,8 @@ def cases():
     out.append(Case("linear_drag+body_force", law, parameters, two, seed=len(out)))
     two = {"linear_drag": {"rate": 0.6}, "viscosity": {"viscosity": 60.0}}
     out.append(Case("linear_drag+viscosity", law, parameters, two, seed=len(out)))
+    for name, values in OUTSIDE.items():
+        out.append(Case(f"unknown_{name}", law, parameters, {}, seed=len(out), outside={name: values}))
     return out
 
 
@@ -80,6 +88,8 @@ def refined(case, particles, laws):
     from masiv.refine.model import Simulation
     from masiv.refine.observed import SampledMotion
     from masiv.refine.prepare import experiment_of
+    from masiv.refine.stage import Refined
+    from masiv.refine.summary import verdict
 
     torch.set_num_threads(1)
     scene, motion = observed(case)
@@ -97,7 +107,9 @@ def refined(case, particles, laws):
     first = outcome.rounds[0] if outcome.rounds else None
     return {
         "case": case.name,
-        "true": {k: v for k, v in case.effects.items()},
+        "true": {**case.effects, **case.outside},
+        "verdict": verdict(Refined(outcome, simulation, [], [], None), config),
+        "gap": None if outcome.gap is None else [outcome.gap.fit_mm, outcome.gap.held_out_mm],
         "laws": [f.model.family.kind for f in fits],
         "noise_mm": 1e3 * experiment.noise,
         "excess": [excess(outcome.before, simulation.experiments), excess(outcome.after, simulation.experiments)],
@@ -114,7 +126,7 @@ def refined(case, particles, laws):
         "confusable": first.confusable if first else {},
         "before": [outcome.before.fit_mm, outcome.before.held_out_mm],
         "after": [outcome.after.fit_mm, outcome.after.held_out_mm],
-        "oracle": oracle(simulation, case, outcome),
+        "oracle": None if case.outside else oracle(simulation, case, outcome),
         "seconds": [middle - began, time.time() - middle],
     }  # fmt: skip
 
