@@ -83,6 +83,13 @@ def close_loop(simulation: Simulation, baselines: Sequence[Fitted], config: Refi
             break
         current = done.accepted.fitted
         rivals = [current]
+    left, there_was = excess(current, experiments), excess(before, experiments)
+    if current is not before and left > max(config.unexplained, there_was / 2):
+        for done in rounds:  # no name for what it does not explain
+            if done.accepted is not None:
+                done.accepted.reasons.append(f"it leaves a residual of {left:.1f} times what noise and grid explain")
+                done.accepted = None
+        current = before
     gap = None
     if config.shortlist and excess(current, experiments) > config.unexplained:
         gap = stop_gap(simulation, current, soft, config, say)

@@ -102,7 +102,8 @@ def refine(
             config = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
         outcome = close_loop(simulation, fits, config, progress)
         before = simulation.fields(outcome.before.model, outcome.before.values, held_out=True)
-        after = simulation.fields(outcome.after.model, outcome.after.values, held_out=True)
+        final = outcome.gap or outcome.after
+        after = simulation.fields(final.model, final.values, held_out=True)
         proposal = None if dry_run else propose(simulation, outcome, progress)
         return Refined(outcome, simulation, before, after, proposal)
 
