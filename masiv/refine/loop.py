@@ -162,7 +162,7 @@ def _round(
         if ranking and not names:
             break
         candidates = score(
-            simulation, base, soft=soft, names=names or None,
+            simulation, base, soft=soft, names=names or config.effects or None,
             progress=lambda n, i, k, label=label: say(label, i, k, n),
         )  # fmt: skip
         say(label, 1, 1, candidates[0].effect if candidates else "none")
