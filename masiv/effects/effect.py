@@ -40,6 +40,15 @@ class Setting:
     path: torch.Tensor | None = None
 
 
+@dataclass(frozen=True)
+class Outline:
+    """A body as what it moves through sees it: diameter [m], mass [kg], density of the medium [kg/m^3]."""
+
+    diameter: float
+    mass: float
+    medium_density: float
+
+
 class Effect(ABC):
     """One effect; a subclass a file in ``masiv/effects``, found there by ``masiv.effects.library``.
 
@@ -54,6 +63,20 @@ class Effect(ABC):
     on_grid: ClassVar[str | None] = None
     """``nodes``: ``node_velocity`` acts everywhere, before contact; ``ground``: it is the contact with the ground."""
     on_stress: ClassVar[bool] = False
+
+    of_body: ClassVar[bool] = False
+    """Whether the strength depends on the body (a drag), so that bodies may differ; else it is that of the
+    surroundings, one for all that move in them."""
+    shared: ClassVar[tuple[EffectParameter, ...] | None] = None
+    """The strength as bodies of different size and mass may share it, see ``of``; None: as it is."""
+
+    def of(self, theta: torch.Tensor, body: Outline) -> torch.Tensor:
+        """Values of ``shared`` (P,) -> the parameters of ``body`` (P,)."""
+        return theta
+
+    def contradiction(self, theta: torch.Tensor, body: Outline, speed: float) -> str | None:
+        """Why values of ``shared`` (P,) contradict what the law of this effect assumes of a body at ``speed`` [m/s]."""
+        return None
 
     def node_velocity(self) -> Callable[..., Any]:
         """Taichi function (x, v, held, t, dt, dx, c) -> v, see ``masiv.kernels.effects.NodeKernels``."""

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from masiv.effects.library import effect_named
 from masiv.errors import MasivError
 from masiv.refine.config import RefineConfig
-from masiv.refine.model import Simulation, effect_parameters, parameters
 from masiv.refine.noise import Floor, floor_of
 from masiv.refine.refit import Fitted, chord_fit, column, full_fit, softness, summarised
 from masiv.refine.score import Candidate, alike, score
+from masiv.refine.simulated import Simulated, Term
 
 Say = Callable[[str, int, int, str], None]
 CHORD_STEPS = 8
@@ -58,7 +57,7 @@ class Outcome:
 
 
 def close_loop(
-    simulation: Simulation, baselines: Sequence[Fitted], noise_mm: float, config: RefineConfig, say: Say
+    simulation: Simulated, baselines: Sequence[Fitted], noise_mm: float, config: RefineConfig, say: Say
 ) -> Outcome:
     """Add effects to the best of ``baselines`` (one a law, without effects) until none is confirmed, or the residual is
     near the noise floor ``noise_mm`` of the observation."""
@@ -86,13 +85,13 @@ def ordered(fits: Sequence[Fitted]) -> list[Fitted]:
     return sorted(fits, key=lambda f: f.bic(samples))
 
 
-def again(simulation: Simulation, fitted: Fitted, soft: float) -> Fitted:
+def again(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
     """``fitted`` with its cost in terms of ``soft``, so that costs compare."""
     return summarised(simulation, fitted.model, fitted.parameters, fitted.values, fitted.jacobian, soft=soft)
 
 
 def _round(
-    simulation: Simulation,
+    simulation: Simulated,
     current: Fitted,
     bases: Sequence[Fitted],
     soft: float,
@@ -123,7 +122,7 @@ def _round(
     confusable = _confusable(ranking, trials, config.confusable)
     accepted = None
     for trial in trials:
-        trial.reasons = objections(current, trial.fitted, trial.candidate.effect, floor, config)
+        trial.reasons = _reasons(simulation, current, trial, floor, config)
     for k, trial in enumerate(t for t in trials if t.passes):
         if k > 0:
             break
@@ -132,22 +131,21 @@ def _round(
             budget=2 * len(trial.fitted.parameters) + 6, soft=soft,
         )  # fmt: skip
         trial.fitted = min(final, trial.fitted, key=lambda f: f.cost)
-        trial.reasons = objections(current, trial.fitted, trial.candidate.effect, floor, config)
+        trial.reasons = _reasons(simulation, current, trial, floor, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
 
 
-def refit(simulation: Simulation, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
+def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
     """``base`` with the effect: strengths jointly with law and throw; then its places or frequencies as well."""
-    effect = effect_named(candidate.effect)
-    model = base.model.with_effect(effect.name)
-    params = parameters(model, simulation.experiments)
+    term = simulation.term(candidate.effect)
+    model = base.model.with_effect(term.name)
+    params = simulation.parameters(model)
     names = [p.name for p in params]
-    own = effect_parameters(effect.name)
-    first = [p for p in params if p not in own[effect.strengths :]]
-    jacobian = _assembled(first, base, candidate, [p.name for p in own[: effect.strengths]])
-    others = {p.name: candidate.theta[p.name] for p in own[effect.strengths :]}
-    values = {**base.values, **{p.name: 0.0 for p in own[: effect.strengths]}, **others}
+    first = [p for p in params if p not in term.others]
+    jacobian = _assembled(first, base, candidate, [p.name for p in term.strengths])
+    others = {p.name: candidate.theta[p.name] for p in term.others}
+    values = {**base.values, **{p.name: 0.0 for p in term.strengths}, **others}
     values, residual, jacobian = chord_fit(
         simulation, model, first, values, base.residual, jacobian, steps=CHORD_STEPS, soft=soft
     )
@@ -170,8 +168,14 @@ def _assembled(first, base: Fitted, candidate: Candidate, strengths: list[str]) 
     return np.stack([known[p.name] for p in first], axis=1)
 
 
-def objections(before: Fitted, after: Fitted, effect: str, floor: Floor, config: RefineConfig) -> list[str]:
-    """Why ``effect`` is not accepted; empty where it is."""
+def _reasons(simulation: Simulated, before: Fitted, trial: Trial, floor: Floor, config: RefineConfig) -> list[str]:
+    term = simulation.term(trial.candidate.effect)
+    own = simulation.objections(before, trial.fitted, term, config)
+    return [*objections(before, trial.fitted, term, floor, config), *own]
+
+
+def objections(before: Fitted, after: Fitted, term: Term, floor: Floor, config: RefineConfig) -> list[str]:
+    """Why ``term`` is not accepted; empty where it is."""
     out = []
     removed = math.sqrt(max(before.fit_mm**2 - after.fit_mm**2, 0.0))
     if removed < floor.fit:
@@ -190,11 +194,10 @@ def objections(before: Fitted, after: Fitted, effect: str, floor: Floor, config:
             out.append(
                 f"it removes {100 * share:.0f} % of the held-out error, less than {100 * config.least_gain:.0f} %"
             )
-    strengths = effect_parameters(effect)[: effect_named(effect).strengths]
-    sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in strengths))
+    sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in term.strengths))
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
-    for p in effect_parameters(effect):
+    for p in term.parameters:
         if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper):
             out.append(f"{p.name} runs into the bound of what is possible, {p.upper:g}")
     return out

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from masiv.refine.model import Simulation
 from masiv.refine.refit import Fitted, rms_mm, split
+from masiv.refine.simulated import Simulated
 
 
 def noise_floor_mm(positions: np.ndarray, last_frame: int) -> float:
@@ -44,7 +44,7 @@ class Floor:
         return math.hypot(self.noise, self.fit)
 
 
-def floor_of(noise_mm: float, simulation: Simulation, fitted: Fitted) -> Floor:
+def floor_of(noise_mm: float, simulation: Simulated, fitted: Fitted) -> Floor:
     """The floor for ``fitted``: one more rollout, of all particles. Raises NonFiniteError."""
     changes = [simulation.finer_grid(fitted.model, fitted.values, k) for k in range(len(simulation.experiments))]
     if any(change is None for change in changes):

@@ -11,7 +11,8 @@ import numpy as np
 from masiv.errors import NonFiniteError
 from masiv.identify.correlation import effective_samples
 from masiv.identify.parametric import FIRST_STEP, Parameter, covariance, fit_parameters, robust_weight
-from masiv.refine.model import Experiment, Model, Simulation, parameters
+from masiv.refine.model import Model
+from masiv.refine.simulated import Simulated, Watched
 
 LEAST_GAIN = 1e-3
 
@@ -52,12 +53,12 @@ def robust_cost(residual: np.ndarray, soft: float) -> float:
 
 
 def rms_mm(fields: Sequence[np.ndarray]) -> float:
-    """Root mean square distance of residual fields (K, N, 3) [m], in mm."""
+    """Root mean square distance of residual fields (K, N, A) [m], in mm."""
     squares = np.concatenate([(f**2).sum(2).ravel() for f in fields])
     return 1e3 * float(np.sqrt(squares.mean()))
 
 
-def split(fields: Sequence[np.ndarray], experiments: Sequence[Experiment]) -> tuple[list, list]:
+def split(fields: Sequence[np.ndarray], experiments: Sequence[Watched]) -> tuple[list, list]:
     """Fitted and held-out instants of fields over all frames."""
     fit = [f[: e.rows] for f, e in zip(fields, experiments, strict=True)]
     return fit, [f[e.rows :] for f, e in zip(fields, experiments, strict=True) if e.holds_out]
@@ -73,7 +74,7 @@ def moved(params: Sequence[Parameter], values: Mapping[str, float], step: np.nda
 
 
 def column(
-    simulation: Simulation, model: Model, values: Mapping[str, float], residual: np.ndarray, p: Parameter
+    simulation: Simulated, model: Model, values: Mapping[str, float], residual: np.ndarray, p: Parameter
 ) -> np.ndarray:
     """Derivative (M,) of the residual with respect to ``p``, by a finite difference into the bounds."""
     here = p.fitted(values[p.name])
@@ -91,7 +92,7 @@ def column(
 
 
 def chord_fit(
-    simulation: Simulation,
+    simulation: Simulated,
     model: Model,
     params: Sequence[Parameter],
     values: Mapping[str, float],
@@ -151,7 +152,7 @@ def _free(params: Sequence[Parameter], values: Mapping[str, float], downhill: np
 
 
 def summarised(
-    simulation: Simulation,
+    simulation: Simulated,
     model: Model,
     params: Sequence[Parameter],
     values: Mapping[str, float],
@@ -163,9 +164,7 @@ def summarised(
     fields = simulation.fields(model, values, held_out=True)
     fit, rest = split(fields, simulation.experiments)
     residual = np.concatenate([f.ravel() for f in fit])
-    samples = sum(
-        effective_samples(f, e.problem.start.double().numpy()) for f, e in zip(fit, simulation.experiments, strict=True)
-    )
+    samples = sum(effective_samples(f, e.places) for f, e in zip(fit, simulation.experiments, strict=True) if e.rows)
     weight = robust_weight(residual, soft)
     spread = np.diag(covariance(jacobian * weight[:, None], residual * weight))
     inflation = max(len(residual) - len(params), 1) / max(samples - len(params), 1)
@@ -182,10 +181,10 @@ def summarised(
 
 
 def full_fit(
-    simulation: Simulation, model: Model, values: Mapping[str, float], *, budget: int, soft: float | None = None
+    simulation: Simulated, model: Model, values: Mapping[str, float], *, budget: int, soft: float | None = None
 ) -> Fitted:
     """Gauss-Newton with fresh derivatives from ``values`` (defaults where missing), and standard errors."""
-    params = started(parameters(model, simulation.experiments), values)
+    params = started(simulation.parameters(model), values)
     estimate = fit_parameters(
         lambda v: simulation.residual(model, v), params, max_evaluations=budget, robust=True, tolerance=LEAST_GAIN
     )

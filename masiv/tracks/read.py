@@ -53,6 +53,7 @@ def read_tracks(folder: Path) -> Tracks:
         bodies=bodies,
         runs=runs,
         problems=tuple(problems),
+        medium_density=declared.medium_density,
     )
 
 
