@@ -26,6 +26,11 @@ MARKERS_AT = {"tip1": [36, 15, 0], "tip2": [24, -6, 0], "tip3": [6, 36, 0],
 """Of the beam [mm], in the axes of its mesh; the clamped end is at z = 100. Fitted to the rest positions."""
 
 
+BEAM_AT_REST = {("gravity", "a"): [20, 60], ("gravity", "b"): [20, 55],
+                ("load52", "a"): [10, 35], ("load52", "b"): [10, 45]}  # fmt: skip
+"""Frames in which the beam is held straight."""
+
+
 def data_folder() -> Path:
     """Where the measurements are, whether or not they are there."""
     return Path(os.environ.get("MASIV_MEASURED", Path(__file__).parents[2] / "shared" / "measured"))
@@ -56,6 +61,27 @@ def write_balls(source: Path, out: Path) -> Path:
         "layout": "tracks", "units": "m", "up_axis": "y",
         "columns": {"time": "time_s", "markers": {"centre": {"y": "height_m"}}}, "bodies": bodies, "runs": runs,
     })  # fmt: skip
+    return out
+
+
+def write_beam(source: Path, out: Path) -> Path:
+    """A scene of the silicone beam in ``source``: _a is fitted, _b held out, under its own weight and with a load."""
+    out.mkdir(parents=True, exist_ok=True)
+    _link(source / "beam.stl", out)
+    runs = []
+    for kind, condition in (("gravity", ""), ("load52", "load52")):
+        for repeat, use in (("a", "fit"), ("b", "hold_out")):
+            name = f"beam_{kind}_V2_{repeat}.csv"
+            _link(source / name, out)
+            runs.append({"file": name, "name": f"{kind}_{repeat}", "condition": condition, "use": use,
+                         "rest_frames": BEAM_AT_REST[kind, repeat]})  # fmt: skip
+    body = {
+        "density": 1070,
+        "poissons_ratio": 0.499,
+        "geometry": {"mesh": "beam.stl", "units": "mm", "markers_at": MARKERS_AT},
+        "clamp": {"half_space": {"normal": [0, 0, -1], "height": -100}, "markers": ["base1", "base2", "base3"]},
+    }
+    _save(out, {"layout": "tracks", "units": "m", "up_axis": "x", "bodies": {"beam": body}, "runs": runs})
     return out
 
 

@@ -42,11 +42,13 @@ class Setting:
 
 @dataclass(frozen=True)
 class Outline:
-    """A body as what it moves through sees it: diameter [m], mass [kg], density of the medium [kg/m^3]."""
+    """A body as the medium that it moves through sees it: diameter [m], mass [kg]; density [kg/m^3] and viscosity
+    [Pa s] of the medium."""
 
     diameter: float
     mass: float
     medium_density: float
+    medium_viscosity: float
 
 
 class Effect(ABC):
@@ -74,8 +76,8 @@ class Effect(ABC):
         """Values of ``shared`` (P,) -> the parameters of ``body`` (P,)."""
         return theta
 
-    def contradiction(self, theta: torch.Tensor, body: Outline, speed: float) -> str | None:
-        """Why values of ``shared`` (P,) contradict what the law of this effect assumes of a body at ``speed`` [m/s]."""
+    def contradiction(self, theta: torch.Tensor, body: Outline) -> str | None:
+        """Why values of ``shared`` (P,) cannot be, given what is known of the body and the medium."""
         return None
 
     def node_velocity(self) -> Callable[..., Any]:

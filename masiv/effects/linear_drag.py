@@ -25,12 +25,11 @@ class LinearDrag(Effect):
         """k = 3 pi mu d / m of a sphere."""
         return theta * (3 * math.pi * body.diameter / body.mass)
 
-    def contradiction(self, theta, body, speed):
-        """Drag is linear where friction outweighs inertia, up to Reynolds numbers of about 1."""
-        if float(theta[0]) == 0.0:
+    def contradiction(self, theta, body):
+        """No shape has more than a few times the drag of a sphere."""
+        if float(theta[0]) <= 10 * body.medium_viscosity:
             return None
-        reynolds = body.medium_density * speed * body.diameter / float(theta[0])
-        return f"drag is not linear at its Reynolds number of {reynolds:.0f}" if reynolds > 10 else None
+        return f"it takes a medium of {float(theta[0]):.2g} Pa s, and that has {body.medium_viscosity:.2g} Pa s"
 
     def node_velocity(self):
         return _slowed

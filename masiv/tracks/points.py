@@ -26,7 +26,7 @@ from masiv.refine.refit import Fitted, rms_mm
 from masiv.refine.simulated import Term, plain_term
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import Geometry
-from masiv.tracks.tracks import Run, Tracks
+from masiv.tracks.tracks import Body, Run, Tracks
 
 RIGID = Family("rigid", (), {})
 """The law of a body that does not deform: nothing to fit."""
@@ -88,8 +88,6 @@ def point_runs(tracks: Tracks, group: str) -> tuple[PointRun, ...]:
 
 def _point_run(tracks: Tracks, run: Run) -> PointRun:
     body = tracks.bodies[run.body]
-    if body.geometry is None or body.mass is None:
-        raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass")
     if len(run.markers) != 1 or body.clamp is not None:
         raise InputError(
             f"{tracks.path}: run {run.name}: a body of a group flies free and has one marker, its middle: "
@@ -101,9 +99,16 @@ def _point_run(tracks: Tracks, run: Run) -> PointRun:
     if seen.sum() < 6:
         raise InputError(f"{tracks.path}: run {run.name} has {int(seen.sum())} frames in flight: it needs 6 or more")
     times = moving.times[seen]
-    outline = Outline(mean_diameter(body.geometry), body.mass, tracks.medium_density)
+    outline = outline_of(tracks, body)
     observed = moving.positions[seen][:, 0, list(axes)]
     return PointRun(run.name, body.name, times - times[0], observed, axes, run.purpose == "fit", outline)
+
+
+def outline_of(tracks: Tracks, body: Body) -> Outline:
+    """What the medium sees of a body. Raises InputError where its geometry or mass is not known."""
+    if body.geometry is None or body.mass is None:
+        raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass")
+    return Outline(mean_diameter(body.geometry), body.mass, tracks.medium_density, tracks.medium_viscosity)
 
 
 def mean_diameter(geometry: Geometry) -> float:
@@ -296,8 +301,7 @@ class PointSimulation:
     def _contradiction(self, fitted: Fitted, term: Term, body: str) -> str | None:
         run = next(run for run in self.experiments if run.body == body)
         theta = torch.tensor([fitted.values[p.name] for p in self.own(term, body)], dtype=torch.float64)
-        speed = float(np.linalg.norm(run.observed[-1] - run.observed[0])) / float(run.times[-1])
-        return effect_named(term.effect).contradiction(theta, run.outline, speed)
+        return effect_named(term.effect).contradiction(theta, run.outline)
 
     def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
         """A term of all must make no body worse, one of some must make those better, on runs that were held out."""

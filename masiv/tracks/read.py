@@ -54,6 +54,7 @@ def read_tracks(folder: Path) -> Tracks:
         runs=runs,
         problems=tuple(problems),
         medium_density=declared.medium_density,
+        medium_viscosity=declared.medium_viscosity,
     )
 
 

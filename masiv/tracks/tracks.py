@@ -106,7 +106,7 @@ class Run:
 @dataclass(frozen=True)
 class Tracks:
     """A scene of measured points. up (3,) unit; gravity (3,) [m/s²]; ground: the plane, or None; medium_density
-    [kg/m³]: of what the bodies move through."""
+    [kg/m³] and medium_viscosity [Pa s]: of what the bodies move through."""
 
     path: Path
     up: np.ndarray
@@ -116,6 +116,7 @@ class Tracks:
     runs: tuple[Run, ...]
     problems: tuple[str, ...] = ()
     medium_density: float = 1.2
+    medium_viscosity: float = 1.8e-5
 
     layout = "tracks"
 

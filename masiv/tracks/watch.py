@@ -1,0 +1,258 @@
+"""Runs of one deformable body with markers, let go from rest: the simulations that refine's loop works on.
+
+They fulfil ``masiv.refine.simulated.Simulated``. What is fitted beside the law and the effects is when each run was let
+go, since a reader knows it to a few milliseconds; that of a held-out run is found from its own motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+
+from masiv.effects.effect import EffectParameter, Outline, Setting
+from masiv.effects.library import effect_named, effects
+from masiv.errors import InputError, MasivError, NonFiniteError
+from masiv.identify.parametric import Parameter
+from masiv.materials.classical import ClassicalLaw
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.rollout import rollout
+from masiv.refine.config import RefineConfig
+from masiv.refine.model import Model
+from masiv.refine.refit import Fitted
+from masiv.refine.simulated import Term
+from masiv.tracks.body import SimulatedBody, plan, simulated_body
+from masiv.tracks.points import outline_of
+from masiv.tracks.tracks import Run, Tracks
+
+RELEASE_REACH, RELEASE_STEP = 0.03, 1e-3
+FINEST_OUTPUT = 2.5e-3
+"""Time [s] between two states of a rollout that are kept; motion between them is a cubic spline."""
+STABLE = 1.3
+"""A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
+KEPT = 24
+LEAST_SEEN = 0.5
+
+
+@dataclass(frozen=True)
+class BodyRun:
+    """A run from its release on: observed (K, M, 3) [m, world] of the markers tied to the body at ``times`` (K,) [s
+    since the release that the reader found], frames where one is not seen left out. speed [m/s]: their greatest."""
+
+    name: str
+    condition: str
+    times: np.ndarray
+    observed: np.ndarray
+    body: SimulatedBody
+    fitted: bool
+    speed: float
+
+    @property
+    def rows(self) -> int:
+        return len(self.times) if self.fitted else 0
+
+    @property
+    def holds_out(self) -> bool:
+        return not self.fitted
+
+    @property
+    def places(self) -> np.ndarray:
+        return self.body.markers_to_world(self.body.particles[None])[0]
+
+    @property
+    def release(self) -> Parameter:
+        """How much later [s] it was let go."""
+        return Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP)
+
+
+def body_run(tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, duration: float) -> BodyRun:
+    """``run`` for ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises InputError."""
+    if run.release is None:
+        raise InputError(f"{tracks.path}: run {run.name}: nobody knows when it was let go: give rest_frames")
+    body = simulated_body(tracks, run, config, particle_spacing=spacing)
+    cut = run.between(run.release, run.release + duration)
+    markers = list(body.markers)
+    whole = np.isfinite(cut.positions[:, markers]).all(axis=(1, 2))
+    if whole.mean() < LEAST_SEEN or whole.sum() < 6:
+        raise InputError(
+            f"{tracks.path}: run {run.name}: all of {', '.join(run.markers[m] for m in markers)} are seen in "
+            f"{int(whole.sum())} of {len(whole)} frames: leave out with markers those that are rarely seen"
+        )
+    observed = cut.positions[whole][:, markers]
+    times = cut.elapsed[whole]
+    speed = float(np.linalg.norm(np.diff(observed, axis=0), axis=2).max() / np.diff(times).min())
+    return BodyRun(run.name, run.condition, times, observed, body, run.purpose == "fit", speed)
+
+
+class BodySimulation:
+    """Runs of one body. known: values of law and effects that are not fitted; contact: with the ground."""
+
+    def __init__(
+        self,
+        tracks: Tracks,
+        runs: Sequence[BodyRun],
+        config: SimulatorConfig,
+        *,
+        known: Mapping[str, float] | None = None,
+        finer: Sequence[BodyRun] = (),
+    ) -> None:
+        """runs: see ``body_run``; finer: the same with more particles, for what a finer grid changes."""
+        self.tracks = tracks
+        self.experiments: Sequence[BodyRun] = tuple(runs)
+        self.finer = tuple(finer)
+        self.config = config
+        self.known = dict(known or {})
+        self.outline: Outline = outline_of(tracks, next(iter(tracks.bodies.values())))
+        self.ground = tracks.ground is not None
+        self.rollouts = 0
+        self.substeps: dict[tuple[str, float], float] = {}
+        self.kept: dict[tuple, CubicSpline] = {}
+
+    def over(self, runs: Sequence[BodyRun]) -> BodySimulation:
+        """The same with other runs."""
+        return BodySimulation(self.tracks, runs, self.config, known=self.known)
+
+    # -- models -------------------------------------------------------------------------------------------------
+
+    def parameters(self, model: Model) -> tuple[Parameter, ...]:
+        """Law, release of each fitted run, effects; without what is known."""
+        every = [
+            *model.family.parameters,
+            *(run.release for run in self.experiments if run.fitted),
+            *(p for name in model.effects for p in self.term(name).parameters),
+        ]
+        return tuple(p for p in every if p.name not in self.known)
+
+    def candidates(self, model: Model) -> list[str]:
+        """Effects that ``model`` lacks; a clock that is off is a release at another time, and so is fitted already."""
+        taken = not self.ground or any(effect_named(n).on_grid == "ground" for n in model.effects)
+        out = []
+        for name, effect in effects().items():
+            on_ground = effect.on_grid == "ground" or name == "ground_height"
+            if name not in model.effects and name != "time_offset" and not (on_ground and taken):
+                out.append(name)
+        return out
+
+    def term(self, name: str) -> Term:
+        """The effect, its steps in proportion to the body."""
+        effect = effect_named(name)
+        own = [self._parameter(name, p) for p in effect.shared or effect.parameters]
+        cut = effect.strengths
+        guesses = tuple(tuple(g) for g in effect.guesses(self._setting(self.experiments[0])))
+        units = {f"{name}.{p.name}": p.unit for p in effect.shared or effect.parameters}
+        return Term(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
+
+    def _parameter(self, name: str, p: EffectParameter) -> Parameter:
+        size = float(np.ptp(self.experiments[0].body.particles.numpy(), axis=0).max())
+        step = {"kg": 0.05 * self.outline.mass, "m": 0.04 * size}.get(p.unit, p.step)
+        upper = min(p.upper, {"kg": 30 * self.outline.mass}.get(p.unit, p.upper))
+        return Parameter(f"{name}.{p.name}", float(np.clip(p.start, p.lower, upper)), p.lower, upper, step)
+
+    def _setting(self, run: BodyRun) -> Setting:
+        duration = float(run.times[-1])
+        return run.body.effects((), duration=duration, frame_time=duration / (len(run.times) - 1)).setting
+
+    def _members(self, model: Model, values: Mapping[str, float]) -> tuple:
+        out = []
+        for name in model.effects:
+            effect = effect_named(name)
+            given = torch.tensor([values[p.name] for p in self.term(name).parameters], dtype=torch.float32)
+            out.append((effect, effect.of(given, self.outline) if effect.shared else given))
+        return tuple(out)
+
+    def law(self, model: Model, values: Mapping[str, float]) -> ClassicalLaw:
+        """The law among ``values`` and what is known."""
+        both = {**self.known, **values}
+        names = {p.name for p in model.family.parameters} | (self.known.keys() & LAW_NAMES)
+        return ClassicalLaw(model.family.kind, **{n: both[n] for n in names})
+
+    # -- motion -------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
+        """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
+        both = {**self.known, **values}
+        key = (id(run), model.effects, tuple(sorted((n, v) for n, v in both.items() if "@" not in n)))
+        if key in self.kept:
+            return self.kept[key]
+        law = self.law(model, values)
+        last = float(run.times[-1]) + RELEASE_REACH
+        times = np.linspace(0, last, int(np.ceil(last / FINEST_OUTPUT)) + 1)
+        try:
+            planned = plan(run.body, law, times, self.config, speed=run.speed)
+            held = self.substeps.setdefault((run.name, run.body.spacing), planned.simulator.substep)
+            if planned.simulator.substep * STABLE < held:
+                raise NonFiniteError(0, 0, f"the law needs substeps of {planned.simulator.substep:.2g} s, not {held:.2g} s")
+            planned = plan(run.body, law, times, self.config, substep=held)
+            active = run.body.effects(
+                self._members(model, both), duration=last, frame_time=float(np.median(np.diff(run.times)))
+            )
+            self.rollouts += 1
+            state = run.body.released(planned.simulator.dtype)
+            positions = rollout(planned.simulator, law, state, planned.steps, planned.outputs, active)
+        except (InputError, NonFiniteError):
+            raise
+        except MasivError as failed:
+            raise NonFiniteError(0, 0, str(failed)) from failed
+        spline = CubicSpline(np.array(planned.outputs) * held, run.body.markers_to_world(positions))
+        if len(self.kept) >= KEPT:
+            self.kept.pop(next(iter(self.kept)))
+        self.kept[key] = spline
+        return spline
+
+    def markers(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
+        """Markers (K, M, 3) [m, world] of the model at the run's times."""
+        path = self.path(run, model, values)
+        shift = values[run.release.name] if run.fitted else self._release(run, path)
+        return path(np.clip(run.times - shift, 0.0, None))
+
+    def _release(self, run: BodyRun, path: CubicSpline) -> float:
+        """How much later a held-out run was let go: nearest to its motion."""
+        shift, slope = 0.0, path.derivative()
+        for _ in range(8):
+            at = np.clip(run.times - shift, 0.0, None)
+            along = (slope(at) * (run.times > shift)[:, None, None]).ravel()
+            off = (path(at) - run.observed).ravel()
+            shift = float(np.clip(shift + along @ off / (along @ along), -RELEASE_REACH, RELEASE_REACH))
+        return shift
+
+    def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
+        """Simulated less observed (K, M, 3) [m, world] of each run; of a held-out run nothing but on request."""
+        return [
+            self.markers(run, model, values) - run.observed
+            if run.fitted or held_out
+            else np.zeros((0, *run.observed.shape[1:]))
+            for run in self.experiments
+        ]
+
+    def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
+        """Of the fitted runs, flat."""
+        return np.concatenate([f.ravel() for f in self.fields(model, values)])
+
+    def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
+        """What more particles on their finer grid change."""
+        if not self.finer:
+            return None
+        run, fine = self.experiments[index], self.finer[index]
+        at = run.times - (values[run.release.name] if run.fitted else 0.0)
+        at = np.clip(at, 0.0, None)
+        return self.path(fine, model, values)(at) - self.path(run, model, values)(at)
+
+    def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
+        """What the medium cannot do."""
+        theta = torch.tensor([after.values[p.name] for p in term.parameters], dtype=torch.float64)
+        why = effect_named(term.effect).contradiction(theta, self.outline)
+        return [] if why is None else [why]
+
+
+LAW_NAMES = frozenset({"youngs_modulus", "poissons_ratio", "yield_stress", "friction_angle", "viscosity",
+                       "bulk_modulus", "shear_modulus", "plastic_viscosity"})  # fmt: skip
+
+
+def shortened(run: BodyRun, duration: float) -> BodyRun:
+    """The first ``duration`` [s] of a run."""
+    kept = run.times <= duration
+    return replace(run, times=run.times[kept], observed=run.observed[kept])
