@@ -103,7 +103,14 @@ def _round(
     ranking: list[Candidate] = []
     for base in bases:
         label = f"refine: rank effects, {base.model.family.kind}"
-        candidates = score(simulation, base, soft=soft, progress=lambda n, i, k, label=label: say(label, i, k, n))
+        early = simulation.early(base)
+        start = base if not early else _carried(early[0], base, soft)
+        candidates = score(
+            early[0] if early else simulation,
+            start,
+            soft=soft,
+            progress=lambda n, i, k, label=label: say(label, i, k, n),
+        )
         say(label, 1, 1, candidates[0].effect if candidates else "none")
         if base is bases[0] or not ranking:
             ranking = candidates
@@ -112,7 +119,10 @@ def _round(
             label = f"refine: fit effects, {base.model.family.kind}"
             say(label, done, len(worth), candidate.effect)
             try:
-                trials.append(Trial(candidate, refit(simulation, base, candidate, soft)))
+                fitted = refit(early[0] if early else simulation, start, candidate, soft)
+                for longer in (*early[1:], simulation) if early else ():
+                    fitted = _carried(longer, fitted, soft)
+                trials.append(Trial(candidate, fitted))
             except MasivError as failed:
                 say(label, done, len(worth), f"{candidate.effect}: {failed}")
         if worth:
@@ -134,6 +144,12 @@ def _round(
         trial.reasons = _reasons(simulation, current, trial, floor, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
+
+
+def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
+    """``fitted`` as a start in another simulation of the same experiments."""
+    budget = 2 * (len(fitted.parameters) + 1)
+    return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft)
 
 
 def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:

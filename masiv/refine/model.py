@@ -112,6 +112,10 @@ class Simulation:
         """The effect, of all that is filmed; its guesses are of the first experiment."""
         return plain_term(name, self.experiments[0].problem.setting())
 
+    def early(self, base) -> list:
+        """None: a fall is short."""
+        return []
+
     def objections(self, before, after, term, config) -> list[str]:
         """None but those of the loop."""
         return []

@@ -106,6 +106,11 @@ class Simulated(Protocol):
         """What a finer grid changes, as a field over all instants of experiment ``index``; None: there is no finer."""
         ...
 
+    def early(self, base: Fitted) -> Sequence[Simulated]:
+        """Shorter simulations through which refits go first, where ``base`` is so far off in the whole one that its
+        derivatives point nowhere; none otherwise."""
+        ...
+
     def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
         """Reasons of its own against adding ``term``."""
         ...

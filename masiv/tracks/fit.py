@@ -59,7 +59,10 @@ def simulation_of(
         return [body_run(tracks, run, simulator, spacing, config.duration) for run in runs_of(tracks, condition)]
 
     fine = made(config.finer_particles) if finer and config.finer_particles > config.particles else []
-    return BodySimulation(tracks, made(config.particles), simulator, known=known, finer=fine)
+    runs = made(config.particles)
+    last = max(float(run.times[-1]) for run in runs)
+    horizons = [h for k in range(16) if (h := config.search_duration * 2**k) < 0.9 * last]
+    return BodySimulation(tracks, runs, simulator, known=known, finer=fine, horizons=horizons)
 
 
 def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:

@@ -31,7 +31,7 @@ from masiv.tracks.tracks import Body, Run, Tracks
 RIGID = Family("rigid", (), {})
 """The law of a body that does not deform: nothing to fit."""
 LONGEST_SUBSTEP = 5e-3
-EACH = "each of "
+EACH = "each"
 REFITS = 4
 """Gauss-Newton steps for the start of a run that is held out; without drag one is exact."""
 
@@ -177,7 +177,10 @@ class PointSimulation:
         """``effect`` on ``bodies`` alone, all with the same strength or ``each`` with its own; on all, with the same,
         where none are given."""
         known = effect_named(effect)
-        name = f"{effect}@{EACH if each else ''}{'+'.join(bodies)}" if bodies else effect
+        scope = "+".join(bodies)
+        if each:
+            scope = EACH if bodies == self.bodies else f"{EACH} of {scope}"
+        name = f"{effect}@{scope}" if bodies else effect
         if name not in self.terms:
             shared: tuple[EffectParameter, ...] = known.shared or known.parameters
             cut = known.strengths
@@ -297,6 +300,10 @@ class PointSimulation:
             if run.fitted == fitted:
                 own.setdefault(run.body, []).append(field)
         return {body: rms_mm(found) for body, found in own.items()}
+
+    def early(self, base: Fitted) -> Sequence[PointSimulation]:
+        """None: a flight has no phase to lose."""
+        return ()
 
     def _contradiction(self, fitted: Fitted, term: Term, body: str) -> str | None:
         run = next(run for run in self.experiments if run.body == body)

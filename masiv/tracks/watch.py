@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 
+from masiv.effects.active import ActiveEffects
 from masiv.effects.effect import EffectParameter, Outline, Setting
 from masiv.effects.library import effect_named, effects
 from masiv.errors import InputError, MasivError, NonFiniteError
@@ -22,9 +23,9 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import rollout
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model
-from masiv.refine.refit import Fitted
+from masiv.refine.refit import Fitted, rms_mm
 from masiv.refine.simulated import Term
-from masiv.tracks.body import SimulatedBody, plan, simulated_body
+from masiv.tracks.body import Plan, SimulatedBody, plan, simulated_body
 from masiv.tracks.points import outline_of
 from masiv.tracks.tracks import Run, Tracks
 
@@ -34,7 +35,11 @@ FINEST_OUTPUT = 2.5e-3
 STABLE = 1.3
 """A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
 KEPT = 24
+LOST = 0.7
+"""Share of the swing from which a residual says that the phase is lost."""
 LEAST_SEEN = 0.5
+BESIDE = 0.15
+"""How far from the body, in lengths of it, something that acts on it may be."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,7 @@ def body_run(tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, 
     body = simulated_body(tracks, run, config, particle_spacing=spacing)
     cut = run.between(run.release, run.release + duration)
     markers = list(body.markers)
-    whole = np.isfinite(cut.positions[:, markers]).all(axis=(1, 2))
+    whole = np.asarray(np.isfinite(cut.positions[:, markers]).all(axis=(1, 2)), bool)
     if whole.mean() < LEAST_SEEN or whole.sum() < 6:
         raise InputError(
             f"{tracks.path}: run {run.name}: all of {', '.join(run.markers[m] for m in markers)} are seen in "
@@ -98,8 +103,11 @@ class BodySimulation:
         *,
         known: Mapping[str, float] | None = None,
         finer: Sequence[BodyRun] = (),
+        horizons: Sequence[float] = (),
     ) -> None:
-        """runs: see ``body_run``; finer: the same with more particles, for what a finer grid changes."""
+        """runs: see ``body_run``; finer: the same with more particles, for what a finer grid changes; horizons [s]:
+        after which a search may stop to look."""
+        self.horizons = tuple(horizons)
         self.tracks = tracks
         self.experiments: Sequence[BodyRun] = tuple(runs)
         self.finer = tuple(finer)
@@ -146,10 +154,18 @@ class BodySimulation:
         return Term(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
 
     def _parameter(self, name: str, p: EffectParameter) -> Parameter:
-        size = float(np.ptp(self.experiments[0].body.particles.numpy(), axis=0).max())
-        step = {"kg": 0.05 * self.outline.mass, "m": 0.04 * size}.get(p.unit, p.step)
-        upper = min(p.upper, {"kg": 30 * self.outline.mass}.get(p.unit, p.upper))
-        return Parameter(f"{name}.{p.name}", float(np.clip(p.start, p.lower, upper)), p.lower, upper, step)
+        particles = self.experiments[0].body.particles.numpy()
+        low, high = particles.min(0), particles.max(0)
+        size = float((high - low).max())
+        lower, upper, step = p.lower, p.upper, p.step
+        if p.unit == "kg":
+            upper, step = min(upper, 30 * self.outline.mass), 0.05 * self.outline.mass
+        elif p.unit == "m":
+            step = 0.04 * size
+            if p.name in "xyz":  # a place is in the body or at it
+                k = "xyz".index(p.name)
+                lower, upper = float(low[k]) - BESIDE * size, float(high[k]) + BESIDE * size
+        return Parameter(f"{name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
 
     def _setting(self, run: BodyRun) -> Setting:
         duration = float(run.times[-1])
@@ -171,6 +187,23 @@ class BodySimulation:
 
     # -- motion -------------------------------------------------------------------------------------------------
 
+    def planned(self, run: BodyRun, model: Model, values: Mapping[str, float], times: np.ndarray) -> Plan:
+        """How to simulate ``run`` to ``times`` (T,) [s]: by the substep of its first law. NonFiniteError for one
+        that is much stiffer."""
+        law = self.law(model, values)
+        planned = plan(run.body, law, times, self.config, speed=run.speed)
+        needed = planned.simulator.substep
+        held = self.substeps.setdefault((run.name, run.body.spacing), needed)
+        if needed * STABLE < held:
+            raise NonFiniteError(0, 0, f"the law needs substeps of {needed:.2g} s, not {held:.2g} s")
+        return plan(run.body, law, times, self.config, substep=held)
+
+    def acting(self, run: BodyRun, model: Model, values: Mapping[str, float], duration: float) -> ActiveEffects:
+        """The effects of ``model``, and the clamp."""
+        frame_time = float(np.median(np.diff(run.times)))
+        members = self._members(model, {**self.known, **values})
+        return run.body.effects(members, duration=duration, frame_time=frame_time)
+
     @torch.no_grad()
     def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
         """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
@@ -178,26 +211,21 @@ class BodySimulation:
         key = (id(run), model.effects, tuple(sorted((n, v) for n, v in both.items() if "@" not in n)))
         if key in self.kept:
             return self.kept[key]
-        law = self.law(model, values)
         last = float(run.times[-1]) + RELEASE_REACH
         times = np.linspace(0, last, int(np.ceil(last / FINEST_OUTPUT)) + 1)
         try:
-            planned = plan(run.body, law, times, self.config, speed=run.speed)
-            held = self.substeps.setdefault((run.name, run.body.spacing), planned.simulator.substep)
-            if planned.simulator.substep * STABLE < held:
-                raise NonFiniteError(0, 0, f"the law needs substeps of {planned.simulator.substep:.2g} s, not {held:.2g} s")
-            planned = plan(run.body, law, times, self.config, substep=held)
-            active = run.body.effects(
-                self._members(model, both), duration=last, frame_time=float(np.median(np.diff(run.times)))
-            )
+            planned = self.planned(run, model, values, times)
+            active = self.acting(run, model, values, last)
             self.rollouts += 1
             state = run.body.released(planned.simulator.dtype)
+            law = self.law(model, values)
             positions = rollout(planned.simulator, law, state, planned.steps, planned.outputs, active)
         except (InputError, NonFiniteError):
             raise
         except MasivError as failed:
             raise NonFiniteError(0, 0, str(failed)) from failed
-        spline = CubicSpline(np.array(planned.outputs) * held, run.body.markers_to_world(positions))
+        at = np.array(planned.outputs) * planned.simulator.substep
+        spline = CubicSpline(at, run.body.markers_to_world(positions))
         if len(self.kept) >= KEPT:
             self.kept.pop(next(iter(self.kept)))
         self.kept[key] = spline
@@ -206,7 +234,8 @@ class BodySimulation:
     def markers(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Markers (K, M, 3) [m, world] of the model at the run's times."""
         path = self.path(run, model, values)
-        shift = values[run.release.name] if run.fitted else self._release(run, path)
+        known = values.get(run.release.name) if run.fitted else None
+        shift = self._release(run, path) if known is None else known
         return path(np.clip(run.times - shift, 0.0, None))
 
     def _release(self, run: BodyRun, path: CubicSpline) -> float:
@@ -240,6 +269,14 @@ class BodySimulation:
         at = run.times - (values[run.release.name] if run.fitted else 0.0)
         at = np.clip(at, 0.0, None)
         return self.path(fine, model, values)(at) - self.path(run, model, values)(at)
+
+    def early(self, base: Fitted) -> Sequence[BodySimulation]:
+        """The first moments, then ever more, where the residual is as large as the swing: then the phase is lost."""
+        swing = [run.observed - run.observed.mean(0) for run in self.experiments if run.fitted]
+        if base.fit_mm < LOST * rms_mm(swing):
+            return ()
+        runs = [run for run in self.experiments if run.fitted]
+        return [self.over([shortened(run, horizon) for run in runs]) for horizon in self.horizons]
 
     def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
         """What the medium cannot do."""
