@@ -142,7 +142,7 @@ def balls(source: Path) -> dict:
         },
         "gravity": 9.8 * (1 + first["gravity_scale"].fitted.values["gravity_scale.relative_change"])
         if "gravity_scale" in first else None,
-        "noise_mm": found.noise_mm, "flights": simulation.rollouts, "seconds": seconds,
+        "flights": simulation.rollouts, "seconds": seconds,
     }  # fmt: skip
 
 

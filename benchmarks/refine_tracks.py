@@ -42,28 +42,33 @@ STRENGTHS = {
     "time_offset": [{"delay": 0.02}, {"delay": -0.015}],
 }  # fmt: skip
 
+OUTSIDE = {
+    "attraction": {"strength": 0.5, "x": 0.6, "y": 0.7, "z": 0.5},
+    "gust": {"acceleration": 20.0, "begin": 0.1, "end": 0.2},
+    "swelling": {"pressure": 4000.0},
+}
+
 
 def cases():
-    """Every effect at its strengths in one material each in turn, and controls of every material."""
+    """Controls of every material; every effect, strong on an elastic body and weak on another; two at once; unknown."""
     from track_cases import Case
 
-    out, turn = [], 0
+    out = []
     for material, (law, parameters) in MATERIALS.items():
         out.append(Case(f"control_{material}", law, parameters, {}, seed=len(out)))
     for effect, strengths in STRENGTHS.items():
-        for k, values in enumerate(strengths):
-            for material in (
-                ("elastic", "plastic") if effect not in ("viscosity", "restitution") else ("elastic", "stiff")
-            ):
-                law, parameters = MATERIALS[material]
-                name = f"{effect}_{k}_{material}"
-                out.append(Case(name, law, parameters, {effect: values}, seed=len(out)))
-                turn += 1
+        # What damps or bounces would hardly show beside plastic flow.
+        other = "stiff" if effect in ("viscosity", "restitution") else "plastic"
+        for values, material in ((strengths[-1], "elastic"), (strengths[0], other)):
+            law, parameters = MATERIALS[material]
+            out.append(Case(f"{effect}_{material}", law, parameters, {effect: values}, seed=len(out)))
     law, parameters = ELASTIC
     two = {"linear_drag": {"rate": 0.6}, "body_force": STRENGTHS["body_force"][1]}
     out.append(Case("linear_drag+body_force", law, parameters, two, seed=len(out)))
     two = {"linear_drag": {"rate": 0.6}, "viscosity": {"viscosity": 60.0}}
     out.append(Case("linear_drag+viscosity", law, parameters, two, seed=len(out)))
+    for name, values in OUTSIDE.items():
+        out.append(Case(f"unknown_{name}", law, parameters, {}, seed=len(out), outside={name: values}))
     return out
 
 
@@ -76,11 +81,12 @@ def refined(case, particles, laws):
     from masiv.mpm.config import SimulatorConfig
     from masiv.refine.baselines import baselines
     from masiv.refine.config import RefineConfig
-    from masiv.refine.loop import close_loop
+    from masiv.refine.loop import close_loop, excess
     from masiv.refine.model import Simulation
-    from masiv.refine.noise import noise_floor_mm
     from masiv.refine.observed import SampledMotion
     from masiv.refine.prepare import experiment_of
+    from masiv.refine.stage import Refined
+    from masiv.refine.summary import verdict
 
     torch.set_num_threads(1)
     scene, motion = observed(case)
@@ -91,18 +97,20 @@ def refined(case, particles, laws):
         "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config, seed=0
     )
     simulation = Simulation([experiment])
-    noise = noise_floor_mm(cut.positions, launch.last_frame)
     began = time.time()
     fits = baselines(simulation, few, fewer, min(launch.last_frame + 2, few.frames), config, Checkpoint(None), quiet)
     middle = time.time()
-    outcome = close_loop(simulation, fits, noise, config, quiet)
+    outcome = close_loop(simulation, fits, config, quiet)
     first = outcome.rounds[0] if outcome.rounds else None
     return {
         "case": case.name,
-        "true": {k: v for k, v in case.effects.items()},
+        "true": {**case.effects, **case.outside},
+        "verdict": verdict(Refined(outcome, simulation, [], [], None), config),
+        "gap": None if outcome.gap is None else [outcome.gap.fit_mm, outcome.gap.held_out_mm],
         "laws": [f.model.family.kind for f in fits],
-        "noise_mm": noise,
-        "grid_mm": [outcome.floor.fit, outcome.floor.held_out],
+        "noise_mm": 1e3 * experiment.noise,
+        "excess": [excess(outcome.before, simulation.experiments), excess(outcome.after, simulation.experiments)],
+        "sigma_mm": (1e3 * simulation.experiments[0].sigma).round(1).tolist(),
         "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
         "trials": [
             (t.fitted.model.family.kind, t.candidate.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.reasons)
@@ -115,7 +123,7 @@ def refined(case, particles, laws):
         "confusable": first.confusable if first else {},
         "before": [outcome.before.fit_mm, outcome.before.held_out_mm],
         "after": [outcome.after.fit_mm, outcome.after.held_out_mm],
-        "oracle": oracle(simulation, case, outcome),
+        "oracle": None if case.outside else oracle(simulation, case, outcome),
         "seconds": [middle - began, time.time() - middle],
     }  # fmt: skip
 
@@ -164,7 +172,7 @@ def main():
     parser.add_argument("--out", default="refine_tracks.jsonl")
     parser.add_argument("--only", default="")
     parser.add_argument("--particles", type=int, default=1500)
-    parser.add_argument("--laws", default="", help="families that compete, with commas; all where empty")
+    parser.add_argument("--laws", default="", help="families that compete, with commas; the case's own where empty")
     parser.add_argument("--table")
     options = parser.parse_args()
     if options.table:
@@ -178,7 +186,8 @@ def main():
     for case in cases():
         if case.name in done or (options.only and options.only not in case.name):
             continue
-        row = refined(case, options.particles, [n for n in options.laws.split(",") if n])
+        laws = [n for n in options.laws.split(",") if n] or [case.law]
+        row = refined(case, options.particles, laws)
         with out.open("a") as file:
             file.write(json.dumps(row) + "\n")
         print(case.name, "->", row["accepted"], [round(x) for x in row["seconds"]], flush=True)

@@ -6,11 +6,12 @@ The motion is simulated with more particles on a finer grid than any model of it
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
+from unknown_effects import UNKNOWN
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.effect import Setting
@@ -32,7 +33,8 @@ SHAPE = ShapeSpec(kind="capsule", size=0.5, rotation_deg=(20.0, 0.0, 35.0), clea
 
 @dataclass(frozen=True)
 class Case:
-    """effects: {name: {parameter: value}}, what the model is not told."""
+    """effects: {name: {parameter: value}}, what the model is not told. outside: the same of ``unknown_effects``, which
+    no library has."""
 
     name: str
     law: str
@@ -47,6 +49,7 @@ class Case:
     noise_mm: float = 2.0
     seed: int = 0
     contact: str = "sticky"
+    outside: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
 def observed(case: Case) -> tuple[Scene, SampledMotion]:
@@ -64,6 +67,9 @@ def observed(case: Case) -> tuple[Scene, SampledMotion]:
     members, late = [], 0.0
     for name, values in case.effects.items():
         effect = effect_named(name)
+        members.append((effect, torch.tensor([values[p.name] for p in effect.parameters])))
+    for name, values in case.outside.items():
+        effect = UNKNOWN[name]
         members.append((effect, torch.tensor([values[p.name] for p in effect.parameters])))
     active = ActiveEffects(tuple(members), setting)
     raised, late = float(active.ground_shift()), round(float(active.time_shift()) * FPS * steps)

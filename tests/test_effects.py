@@ -53,7 +53,7 @@ def present(effect):
     """Parameters of a clear case of the effect, at the guess that is nearest to the body's lower end."""
     x = body()
     guesses = effect.guesses(setting(x))
-    strengths = [8 * p.step for p in effect.parameters[: effect.strengths]]
+    strengths = [(8 + k) * p.step for k, p in enumerate(effect.parameters[: effect.strengths])]
     return torch.tensor([*strengths, *guesses[0]], dtype=F64)
 
 

@@ -198,3 +198,17 @@ def test_ground_height_and_time_offset_hand_their_shift_to_the_caller():
     assert active.time_shift().item() == pytest.approx(-0.004)
     (active.ground_shift() + 2 * active.time_shift()).backward()
     assert [theta.grad.item() if theta.grad is not None else None for _, theta in active.members] == [1.0, 2.0, None]
+
+
+def test_smooth_force_is_linear_between_its_instants_and_in_space():
+    still = {f"{p.name}": 0.0 for p in effects()["smooth_force"].parameters}
+    span = 0.12
+    ramp = {**still, "span": span, **{f"acceleration_{k}_x": float(k) for k in range(4)}, "acceleration_3_z": 2.0}
+    v = last_velocity(run("smooth_force", list(ramp.values()), 150, gravity=WEIGHTLESS))
+    held = 0.15 - span  # after the last instant it stays as it is
+    np.testing.assert_allclose(v, [1.5 * span + 3 * held, 0, span / 3 + 2 * held], atol=2e-3)
+    pull = {**still, "span": span, "gradient_x_along_y": 3.0, "gradient_z_along_x": -2.0}
+    x = body(height=5.0)
+    middle = x.mean(0).numpy()
+    v = last_velocity(run("smooth_force", list(pull.values()), 10, x=x, gravity=WEIGHTLESS))
+    np.testing.assert_allclose(v, [0.01 * 3 * middle[1], 0, -0.01 * 2 * middle[0]], rtol=1e-3, atol=1e-5)

@@ -20,7 +20,7 @@ from masiv.mpm.rollout import rollout
 from masiv.mpm.simulate import thrown
 from masiv.mpm.simulator import Simulator
 from masiv.refine.config import RefineConfig
-from masiv.refine.noise import noise_floor_mm
+from masiv.refine.noise import noise_floor
 from masiv.refine.observed import SampledMotion
 from masiv.refine.refit import moved
 from masiv.refine.stage import Throw, refine, split_frames
@@ -106,7 +106,7 @@ def test_noise_of_a_rigid_flight_is_found_whatever_the_flight():
         path.append(body @ turn.T + [0.1 * k**1.5, -0.02 * k**2, 0.3 * np.sin(k)])
     noisy = np.array(path)
     noisy[1:] += random.normal(0, 2e-3, noisy[1:].shape)
-    assert noise_floor_mm(noisy, 7) == pytest.approx(2 * np.sqrt(3), rel=0.05)
+    assert noise_floor(noisy, 7) == pytest.approx(2e-3 * np.sqrt(3), rel=0.05)
 
 
 def test_held_out_frames_are_the_runs_own_or_the_last_quarter():

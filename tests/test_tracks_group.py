@@ -119,7 +119,7 @@ def test_clean_flights_lack_nothing(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.0)}
     refined = found(write_scene(tmp_path, balls))
     assert refined.outcome.after.model.effects == ()
-    assert refined.noise_mm == pytest.approx(10, rel=0.4)
+    assert refined.simulation.experiments[0].noise == pytest.approx(0.01, rel=0.4)
 
 
 def test_what_cannot_be_a_group(tmp_path):

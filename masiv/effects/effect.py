@@ -65,6 +65,8 @@ class Effect(ABC):
     on_grid: ClassVar[str | None] = None
     """``nodes``: ``node_velocity`` acts everywhere, before contact; ``ground``: it is the contact with the ground."""
     on_stress: ClassVar[bool] = False
+    cause: ClassVar[bool] = True
+    """False for a stop-gap, which no search may name."""
 
     of_body: ClassVar[bool] = False
     """Whether the strength depends on the body (a drag), so that bodies may differ; else it is that of the

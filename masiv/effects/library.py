@@ -13,6 +13,11 @@ from masiv.errors import InputError
 _NOT_EFFECTS = {"effect", "library", "active"}
 
 
+def causes() -> dict[str, Effect]:
+    """The effects that a search may name: all but stop-gaps."""
+    return {name: effect for name, effect in effects().items() if effect.cause}
+
+
 @functools.lru_cache(maxsize=1)
 def effects() -> dict[str, Effect]:
     """Every effect by its name, in alphabetical order. Adding one is adding its file."""

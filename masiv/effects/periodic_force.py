@@ -8,7 +8,7 @@ import torch
 
 from masiv.effects.effect import Effect, EffectParameter
 
-_GUESSES = 8
+_GUESSES = 5
 
 
 @ti.func

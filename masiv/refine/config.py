@@ -19,13 +19,18 @@ class RefineConfig(BaseModel):
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
     above_noise: float = Field(
-        1.2, ge=1, description="residual over the floor of noise and grid below which nothing is looked for"
+        1.2, ge=0, description="residual over what noise and grid explain, below which nothing is looked for"
     )
     unexplained: float = Field(
         3.0, ge=1, description="residual over the same floor from which it is called unexplained, not nothing"
     )
     least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")
     least_gain: float = Field(0.15, ge=0, le=1, description="share of the held-out error that an effect must remove")
+    decisive: float = Field(
+        4.0, ge=1,
+        description="variance that an effect must explain, over the noise's, in the phase where the simulation is as "
+        "certain as the observation, to be accepted although held-out frames are too uncertain to tell",
+    )  # fmt: skip
     least_bic: float = Field(10.0, ge=0, description="how far an effect must lower the information criterion")
     least_sigmas: float = Field(4.0, ge=0, description="standard errors that a strength must lie from zero")
     confusable: float = Field(0.95, gt=0, le=1, description="correlation from which two effects look alike")

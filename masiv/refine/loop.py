@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from masiv.errors import MasivError
 from masiv.refine.config import RefineConfig
-from masiv.refine.noise import Floor, floor_of
-from masiv.refine.refit import Fitted, chord_fit, column, full_fit, softness, summarised
+from masiv.refine.noise import uncertainty
+from masiv.refine.refit import Fitted, chord_fit, column, full_fit, reweighted, softness, summarised
 from masiv.refine.score import Candidate, alike, score
-from masiv.refine.simulated import Simulated, Term
+from masiv.refine.simulated import Simulated, Term, Watched
 
 Say = Callable[[str, int, int, str], None]
 CHORD_STEPS = 8
+STOP_GAP = "smooth_force"
+SOFT = 5.0
+"""Sizes of the noise from which a weighted residual counts as wild, at the least."""
+CERTAIN = 1.5
+"""Times the noise that sigma is where the motion is as well simulated as it is observed."""
 TELLS_APART = 6.0
 """Difference of the information criterion below which two refits explain the data equally well."""
 
@@ -47,34 +52,82 @@ class Round:
 
 @dataclass
 class Outcome:
-    """before: the best model without effects. after: with what was accepted, ``before`` itself where nothing was."""
+    """before: the best model without effects. after: with what was accepted, ``before`` itself where nothing was.
+    gap: ``after`` with a smooth force for what is still unexplained, None where there is no need or no use."""
 
     before: Fitted
     after: Fitted
     rounds: list[Round]
-    soft: float
-    floor: Floor
+    gap: Fitted | None = None
 
 
-def close_loop(
-    simulation: Simulated, baselines: Sequence[Fitted], noise_mm: float, config: RefineConfig, say: Say
-) -> Outcome:
+def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: RefineConfig, say: Say) -> Outcome:
     """Add effects to the best of ``baselines`` (one a law, without effects) until none is confirmed, or the residual is
-    near the noise floor ``noise_mm`` of the observation."""
-    soft = softness(min(baselines, key=lambda f: f.cost).residual)
-    rivals = ordered([again(simulation, f, soft) for f in baselines])[: config.families]
-    before = rivals[0]
-    floor = floor_of(noise_mm, simulation, before)
+    near what noise and grid explain. Gives the experiments of ``simulation`` their sigma."""
+    least = min(baselines, key=lambda f: f.cost)
+    weigh(simulation, least)
+    soft = max(softness(simulation.residual(least.model, least.values)), SOFT * simulation.experiments[0].noise)
+    rivals = []
+    for done, base in enumerate(baselines):
+        say("refine: weigh", done, len(baselines), base.model.family.kind)
+        rivals.append(reweighted(simulation, base, steps=CHORD_STEPS, soft=soft))
+    rivals = ordered(rivals)[: config.families]
+    before = current = rivals[0]
     rounds: list[Round] = []
-    current = before
-    while len(rounds) < config.max_effects and current.fit_mm > config.above_noise * floor.total:
-        done = _round(simulation, current, rivals, soft, floor, config, say)
+    experiments = simulation.experiments
+    while len(rounds) < config.max_effects and excess(current, experiments) > config.above_noise:
+        done = _round(simulation, current, rivals, soft, config, say)
         rounds.append(done)
         if done.accepted is None:
             break
         current = done.accepted.fitted
         rivals = [current]
-    return Outcome(before, current, rounds, soft, floor)
+    gap = None
+    if config.shortlist and excess(current, experiments) > config.unexplained:
+        gap = stop_gap(simulation, current, soft, config, say)
+    return Outcome(before, current, rounds, gap)
+
+
+def stop_gap(simulation: Simulated, current: Fitted, soft: float, config: RefineConfig, say: Say) -> Fitted | None:
+    """``current`` with a smooth force that stands in for what is not known; None where held-out data does not bear it
+    out."""
+    label = "refine: a smooth force for the rest"
+    found = score(simulation, current, soft=soft, names=[STOP_GAP], progress=lambda n, i, k: say(label, i, k, n))
+    if not found:
+        return None
+    try:
+        fitted = refit(simulation, current, found[0], soft)
+    except MasivError as failed:
+        say(label, 1, 1, str(failed))
+        return None
+    say(label, 1, 1, f"{fitted.fit_mm:.1f} mm")
+    term = simulation.term(STOP_GAP)
+    return None if objections(current, fitted, term, simulation.experiments, config) else fitted
+
+
+def weigh(simulation: Simulated, fitted: Fitted) -> None:
+    """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves."""
+    model, values = fitted.model, fitted.values
+    simulation.experiments = tuple(
+        replace(e, sigma=uncertainty(simulation, model, values, k)) for k, e in enumerate(simulation.experiments)
+    )
+
+
+def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:
+    """Root mean square residual over the fitted instants in units of sigma, in the phase of the motion (well known, or
+    not) where it is largest: about 1 where nothing is missing."""
+    return math.sqrt(max(_phases([s / e.sigma**2 for s, e in zip(fitted.squares, experiments, strict=True)],
+                                 experiments)))  # fmt: skip
+
+
+def _phases(ratios: Sequence[np.ndarray], experiments: Sequence[Watched]) -> list[float]:
+    """Means of ``ratios`` (K,) over fitted instants whose sigma is hardly more than the noise, and over the others."""
+    known, rest = [], []
+    for ratio, e in zip(ratios, experiments, strict=True):
+        certain = e.sigma[: e.rows] < CERTAIN * e.noise
+        known.append(ratio[: e.rows][certain])
+        rest.append(ratio[: e.rows][~certain])
+    return [float(found.mean()) for found in (np.concatenate(known), np.concatenate(rest)) if len(found)]
 
 
 def ordered(fits: Sequence[Fitted]) -> list[Fitted]:
@@ -85,17 +138,11 @@ def ordered(fits: Sequence[Fitted]) -> list[Fitted]:
     return sorted(fits, key=lambda f: f.bic(samples))
 
 
-def again(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
-    """``fitted`` with its cost in terms of ``soft``, so that costs compare."""
-    return summarised(simulation, fitted.model, fitted.parameters, fitted.values, fitted.jacobian, soft=soft)
-
-
 def _round(
     simulation: Simulated,
     current: Fitted,
     bases: Sequence[Fitted],
     soft: float,
-    floor: Floor,
     config: RefineConfig,
     say: Say,
 ) -> Round:
@@ -103,17 +150,18 @@ def _round(
     ranking: list[Candidate] = []
     for base in bases:
         label = f"refine: rank effects, {base.model.family.kind}"
+        # What the best law's ranking leaves out is not looked at again for the next law.
+        names = [c.effect for c in ranking if c.explained >= config.least_explained][: config.shortlist]
+        if ranking and not names:
+            break
         early = simulation.early(base)
         start = base if not early else _carried(early[0], base, soft)
         candidates = score(
-            early[0] if early else simulation,
-            start,
-            soft=soft,
+            early[0] if early else simulation, start, soft=soft, names=names or None,
             progress=lambda n, i, k, label=label: say(label, i, k, n),
-        )
+        )  # fmt: skip
         say(label, 1, 1, candidates[0].effect if candidates else "none")
-        if base is bases[0] or not ranking:
-            ranking = candidates
+        ranking = ranking or candidates
         worth = [c for c in candidates if c.explained >= config.least_explained][: config.shortlist]
         for done, candidate in enumerate(worth):
             label = f"refine: fit effects, {base.model.family.kind}"
@@ -132,7 +180,7 @@ def _round(
     confusable = _confusable(ranking, trials, config.confusable)
     accepted = None
     for trial in trials:
-        trial.reasons = _reasons(simulation, current, trial, floor, config)
+        trial.reasons = _reasons(simulation, current, trial, config)
     for k, trial in enumerate(t for t in trials if t.passes):
         if k > 0:
             break
@@ -141,7 +189,7 @@ def _round(
             budget=2 * len(trial.fitted.parameters) + 6, soft=soft,
         )  # fmt: skip
         trial.fitted = min(final, trial.fitted, key=lambda f: f.cost)
-        trial.reasons = _reasons(simulation, current, trial, floor, config)
+        trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
 
@@ -184,32 +232,27 @@ def _assembled(first, base: Fitted, candidate: Candidate, strengths: list[str]) 
     return np.stack([known[p.name] for p in first], axis=1)
 
 
-def _reasons(simulation: Simulated, before: Fitted, trial: Trial, floor: Floor, config: RefineConfig) -> list[str]:
+def _reasons(simulation: Simulated, before: Fitted, trial: Trial, config: RefineConfig) -> list[str]:
     term = simulation.term(trial.candidate.effect)
-    own = simulation.objections(before, trial.fitted, term, config)
-    return [*objections(before, trial.fitted, term, floor, config), *own]
+    general = objections(before, trial.fitted, term, simulation.experiments, config)
+    return [*general, *simulation.objections(before, trial.fitted, term, config)]
 
 
-def objections(before: Fitted, after: Fitted, term: Term, floor: Floor, config: RefineConfig) -> list[str]:
+def objections(
+    before: Fitted, after: Fitted, term: Term, experiments: Sequence[Watched], config: RefineConfig
+) -> list[str]:
     """Why ``term`` is not accepted; empty where it is."""
     out = []
-    removed = math.sqrt(max(before.fit_mm**2 - after.fit_mm**2, 0.0))
-    if removed < floor.fit:
-        out.append(f"it explains {removed:.1f} mm, and a finer grid alone would change {floor.fit:.1f} mm")
+    gained = [
+        (b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)
+    ]  # of the variance that noise and grid would explain
+    share = max(_phases(gained, experiments))
+    if share < 1:
+        out.append(f"it explains {max(share, 0.0):.2g} of what noise and a finer grid alone could change")
     gain = before.bic(after.samples) - after.bic(after.samples)
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
-    if before.held_out_mm is not None and after.held_out_mm is not None:
-        share = 1 - after.held_out_mm / before.held_out_mm
-        removed = math.sqrt(max(before.held_out_mm**2 - after.held_out_mm**2, 0.0))
-        if removed < floor.held_out:
-            out.append(
-                f"it explains {removed:.1f} mm held out, and a finer grid alone would change {floor.held_out:.1f} mm"
-            )
-        if share < config.least_gain:
-            out.append(
-                f"it removes {100 * share:.0f} % of the held-out error, less than {100 * config.least_gain:.0f} %"
-            )
+    out += _held_out(before, after, gained, experiments, config)
     sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in term.strengths))
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
@@ -217,6 +260,26 @@ def objections(before: Fitted, after: Fitted, term: Term, floor: Floor, config: 
         if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper):
             out.append(f"{p.name} runs into the bound of what is possible, {p.upper:g}")
     return out
+
+
+def _held_out(
+    before: Fitted, after: Fitted, gained: Sequence[np.ndarray], experiments: Sequence[Watched], config: RefineConfig
+) -> list[str]:
+    """What the held-out instants, weighted as the others, say against ``after``."""
+    rest = [k for k, e in enumerate(experiments) if e.holds_out]
+    if not rest:
+        return []
+    won = np.concatenate([gained[k][experiments[k].rows :] for k in rest])
+    old = np.concatenate([(before.squares[k] / experiments[k].sigma ** 2)[experiments[k].rows :] for k in rest])
+    removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
+    if won.mean() >= 1 and removed >= config.least_gain:
+        return []
+    if abs(won.mean()) < 1 and _phases(gained, experiments)[0] >= config.decisive:
+        return []  # they cannot tell, where the body flies or is otherwise well simulated it is plain
+    return [
+        f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * config.least_gain:.0f} %), "
+        f"{max(float(won.mean()), 0.0):.2g} of what noise and a finer grid alone could change there"
+    ]
 
 
 def _confusable(ranking: list[Candidate], trials: list[Trial], least: float) -> dict[str, list[str]]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.library import effect_named, effects
+from masiv.effects.library import causes, effect_named
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.identify.families import Family, law_of, motion_of, motion_parameters
 from masiv.identify.parametric import Parameter
@@ -21,15 +21,23 @@ from masiv.refine.simulated import Term, effect_parameters, plain_term
 class Experiment:
     """One throw: rollouts of the body against its observed motion, of which frames 1…fitted-1 may be fitted.
 
-    motion: of ``problem``'s start, simulation frame. fine: the same with all particles, of which those of ``problem``
-    are some.
+    motion: of ``problem``'s start, simulation frame. fine: the same on a finer grid with all particles, of which those
+    of ``problem`` are some. noise: of the observation [m]. sigma (K,): by how much model and observation may differ at
+    each instant [m] with nothing missing; the noise while the rest is not known.
     """
 
     name: str
     problem: Problem
     fitted: int
     motion: Motion
-    fine: Problem | None = None
+    fine: Problem | None
+    noise: float
+    sigma: np.ndarray
+
+    def weighted(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, N, 3) [m] from the first instant on, in proportion to what it says: as it is where sigma is
+        the noise, less where the model itself is less certain."""
+        return field * (self.noise / self.sigma[: len(field), None, None])
 
     @property
     def rows(self) -> int:
@@ -39,6 +47,11 @@ class Experiment:
     @property
     def holds_out(self) -> bool:
         return self.fitted - 1 < self.problem.frames
+
+    @property
+    def instants(self) -> int:
+        """All of them."""
+        return self.problem.frames * self.problem.samples
 
     @property
     def places(self) -> np.ndarray:
@@ -104,8 +117,8 @@ class Simulation:
 
     def candidates(self, model: Model) -> list[str]:
         """Effects that ``model`` lacks; one contact with the ground at most, and none where there is no ground."""
-        library = effects()
-        taken = model.contact == "none" or any(library[n].on_grid == "ground" for n in model.effects)
+        library = causes()
+        taken = model.contact == "none" or any(effect_named(n).on_grid == "ground" for n in model.effects)
         return [n for n, e in library.items() if n not in model.effects and not (taken and e.on_grid == "ground")]
 
     def term(self, name: str) -> Term:
@@ -148,15 +161,16 @@ class Simulation:
         return out
 
     def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
-        """The fitted instants of all experiments, flat."""
-        return np.concatenate([f.ravel() for f in self.fields(model, values)])
+        """The fitted instants of all experiments, weighted, flat."""
+        found = zip(self.experiments, self.fields(model, values), strict=True)
+        return np.concatenate([e.weighted(f).ravel() for e, f in found])
 
     @torch.no_grad()
     def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
-        """What all particles on their finer grid change: (K, N, 3) [m] of the particles of experiment ``index`` over
-        all frames, or None where there are no more particles. Raises NonFiniteError."""
+        """What a finer grid with more particles changes: (K, N, 3) [m] of the particles of experiment ``index`` over
+        all frames, or None where there is none. Raises NonFiniteError."""
         experiment = self.experiments[index]
-        if experiment.fine is None or experiment.fine.count <= experiment.problem.count:
+        if experiment.fine is None:
             return None
         frames = experiment.problem.frames
         fine = _run(experiment.fine, experiment, model, values, frames, None)[:, experiment.problem.chosen]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from masiv.identify.config import IdentifyConfig
@@ -10,8 +11,15 @@ from masiv.identify.problem import Motion, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Experiment
+from masiv.refine.noise import noise_floor
 from masiv.refine.observed import Observed
 from masiv.scene.scene import Scene
+
+LEAST_PER_CELL = 2.0
+LEAST_NOISE = 1e-6
+"""[m], about what single precision leaves of a position."""
+FINER = 0.5
+"""Particles per cell, of the twin's, on the grid that says what the twin's own grid may change."""
 
 
 def experiment_of(
@@ -31,10 +39,12 @@ def experiment_of(
     fitted: the motion over the frames that may be fitted. whole: over all frames; only those after are taken from it.
     """
     settings = identify.model_copy(update={"samples_per_frame": config.samples_per_frame})
-    few = Problem(scene, fitted, settings, simulator, particles=config.particles, seed=seed)
-    fewer = Problem(scene, fitted, settings, simulator, particles=config.search_particles, seed=seed)
-    fine = Problem(scene, whole, settings, simulator)
-    problem = Problem(scene, whole, settings, simulator, particles=config.particles, seed=seed)
+    count = fitted.positions.shape[1]
+    on_few, on_fewer = (thinned(simulator, min(n / count, 1.0)) for n in (config.particles, config.search_particles))
+    few = Problem(scene, fitted, settings, on_few, particles=config.particles, seed=seed)
+    fewer = Problem(scene, fitted, settings, on_fewer, particles=config.search_particles, seed=seed)
+    fine = Problem(scene, whole, settings, thinned(simulator, FINER))
+    problem = Problem(scene, whole, settings, on_few, particles=config.particles, seed=seed)
     problem.targets[: len(few.targets)] = few.targets
     problem.start = few.start
     launch = estimate_launch(fitted.positions, fitted.times, scene.gravity, scene.ground, clearance=few.spacing)
@@ -43,4 +53,12 @@ def experiment_of(
         torch.as_tensor(few.axes.vectors_to_simulation(launch.omega), dtype=torch.float32),
         torch.zeros(()),
     )
-    return Experiment(name, problem, len(fitted.times), motion, fine), few, fewer, launch
+    noise = max(noise_floor(fitted.positions, launch.last_frame), LEAST_NOISE)
+    sigma = np.full(len(problem.targets), noise)
+    return Experiment(name, problem, len(fitted.times), motion, fine, noise, sigma), few, fewer, launch
+
+
+def thinned(simulator: SimulatorConfig, share: float) -> SimulatorConfig:
+    """``simulator`` for a ``share`` of the particles on the same grid, as far as its cells stay filled."""
+    per_cell = max(simulator.particles_per_cell * share, min(LEAST_PER_CELL, simulator.particles_per_cell))
+    return simulator.model_copy(update={"particles_per_cell": per_cell})

@@ -19,10 +19,11 @@ LEAST_GAIN = 1e-3
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model with its parameters. residual (M,) [m] of the fitted instants; jacobian (M, P), per fitted scale.
+    """A model with its parameters. residual (M,) [m] of the fitted instants, weighted; jacobian (M, P) of it.
 
-    cost [m^2]: robust mean square; samples: independent residuals. fit_mm and held_out_mm: root mean square distance;
-    held_out_mm is None where nothing is held out. stderr: of each of the values.
+    cost [m^2]: robust mean square; samples: independent residuals. fit_mm and held_out_mm: root mean square distance,
+    not weighted; held_out_mm is None where nothing is held out. squares: of each experiment, the mean square distance
+    (K,) [m^2] at all instants. stderr: of each of the values.
     """
 
     model: Model
@@ -34,6 +35,7 @@ class Fitted:
     samples: int
     fit_mm: float
     held_out_mm: float | None
+    squares: list[np.ndarray]
     stderr: dict[str, float]
 
     def bic(self, samples: int) -> float:
@@ -53,7 +55,7 @@ def robust_cost(residual: np.ndarray, soft: float) -> float:
 
 
 def rms_mm(fields: Sequence[np.ndarray]) -> float:
-    """Root mean square distance of residual fields (K, N, A) [m], in mm."""
+    """Root mean square distance of residual fields (K, N, 3) [m], in mm."""
     squares = np.concatenate([(f**2).sum(2).ravel() for f in fields])
     return 1e3 * float(np.sqrt(squares.mean()))
 
@@ -141,6 +143,20 @@ def chord_fit(
     return values, residual, jacobian
 
 
+def reweighted(simulation: Simulated, base: Fitted, *, steps: int, soft: float) -> Fitted:
+    """``base`` fitted again to the residual as ``simulation`` weighs it now; fresh derivatives before and after."""
+    params = started(simulation.parameters(base.model), base.values)
+    values = dict(base.values)
+    residual = simulation.residual(base.model, values)
+    for take in (steps, 0):
+        jacobian = np.stack([column(simulation, base.model, values, residual, p) for p in params], axis=1)
+        if take:
+            values, residual, _ = chord_fit(
+                simulation, base.model, params, values, residual, jacobian, steps=take, soft=soft
+            )
+    return summarised(simulation, base.model, params, values, jacobian, soft=soft)
+
+
 def _free(params: Sequence[Parameter], values: Mapping[str, float], downhill: np.ndarray) -> np.ndarray:
     """Indices of parameters that are not held at a bound which the descent would cross."""
     out = []
@@ -163,8 +179,11 @@ def summarised(
     """``Fitted`` of given values: one rollout over all frames; standard errors from ``jacobian``."""
     fields = simulation.fields(model, values, held_out=True)
     fit, rest = split(fields, simulation.experiments)
-    residual = np.concatenate([f.ravel() for f in fit])
-    samples = sum(effective_samples(f, e.places) for f, e in zip(fit, simulation.experiments, strict=True) if e.rows)
+    weighted = [e.weighted(f) for f, e in zip(fit, simulation.experiments, strict=True)]
+    residual = np.concatenate([f.ravel() for f in weighted])
+    samples = sum(
+        effective_samples(f, e.places) for f, e in zip(weighted, simulation.experiments, strict=True) if e.rows
+    )
     weight = robust_weight(residual, soft)
     spread = np.diag(covariance(jacobian * weight[:, None], residual * weight))
     inflation = max(len(residual) - len(params), 1) / max(samples - len(params), 1)
@@ -176,7 +195,7 @@ def summarised(
     }
     return Fitted(
         model, dict(values), tuple(params), residual, jacobian, robust_cost(residual, soft), samples,
-        rms_mm(fit), rms_mm(rest) if rest else None, stderr,
+        rms_mm(fit), rms_mm(rest) if rest else None, [(f**2).sum(2).mean(1) for f in fields], stderr,
     )  # fmt: skip
 
 

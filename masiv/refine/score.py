@@ -39,12 +39,12 @@ def score(
     names: list[str] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Candidate]:
-    """Every effect that ``base`` lacks, best explained first. names: only these."""
+    """Every cause that ``base`` lacks, best explained first. names: only these, of all effects."""
     weight = robust_weight(base.residual, soft)
     nuisance = _basis(base.jacobian * weight[:, None])
     left = _without(nuisance, base.residual * weight)
     found = []
-    todo = [n for n in simulation.candidates(base.model) if names is None or n in names]
+    todo = [n for n in (names or simulation.candidates(base.model)) if n not in base.model.effects]
     for done, name in enumerate(todo):
         if progress is not None:
             progress(name, done, len(todo))

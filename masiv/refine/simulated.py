@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -58,7 +58,21 @@ def plain_term(name: str, setting: Setting) -> Term:
 
 class Watched(Protocol):
     """One experiment: K instants at which N points are compared, the first ``rows`` of them fitted, the rest held
-    out."""
+    out. noise [m]: of the observation; sigma (K,) [m]: by how much model and observation may differ with nothing
+    missing. ``dataclasses.replace`` gives it another sigma."""
+
+    @property
+    def noise(self) -> float: ...
+
+    @property
+    def sigma(self) -> np.ndarray: ...
+
+    @property
+    def instants(self) -> int: ...
+
+    def weighted(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, N, A) [m] from the first instant on, in proportion to what it says."""
+        ...
 
     @property
     def name(self) -> str: ...
@@ -79,9 +93,8 @@ class Simulated(Protocol):
     """Residuals of models over experiments, and the parameters of a model."""
 
     rollouts: int
-
-    @property
-    def experiments(self) -> Sequence[Watched]: ...
+    experiments: Sequence[Any]
+    """Of ``Watched``; the loop replaces them by the same with another sigma."""
 
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
         """Everything that is fitted: law, effects, and the start of each experiment."""
@@ -99,7 +112,7 @@ class Simulated(Protocol):
         ...
 
     def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
-        """The fitted instants of all experiments, flat."""
+        """The fitted instants of all experiments, weighted, flat."""
         ...
 
     def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:

@@ -17,7 +17,6 @@ from masiv.refine.baselines import baselines
 from masiv.refine.config import RefineConfig
 from masiv.refine.loop import Outcome, close_loop
 from masiv.refine.model import Simulation, effect_parameters, throw_of
-from masiv.refine.noise import noise_floor_mm
 from masiv.refine.observed import Observed, first_frames
 from masiv.refine.prepare import experiment_of
 from masiv.refine.propose import Proposal, propose
@@ -51,7 +50,6 @@ class Refined:
     each throw over all frames, at ``samples_per_frame`` instants a frame."""
 
     outcome: Outcome
-    noise_mm: float
     simulation: Simulation
     before: list[np.ndarray]
     after: list[np.ndarray]
@@ -91,7 +89,6 @@ def refine(
         ]
         simulation = Simulation([experiment for experiment, *_ in made])
         _, few, fewer, launch = made[0]
-        noise = noise_floor_mm(first_frames(throws[0].motion, throws[0].fitted).positions, launch.last_frame)
         fits = baselines(
             simulation,
             few,
@@ -102,12 +99,12 @@ def refine(
             progress,
         )
         if dry_run:
-            config = config.model_copy(update={"shortlist": 0, "above_noise": 1.0})
-        outcome = close_loop(simulation, fits, noise, config, progress)
+            config = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
+        outcome = close_loop(simulation, fits, config, progress)
         before = simulation.fields(outcome.before.model, outcome.before.values, held_out=True)
         after = simulation.fields(outcome.after.model, outcome.after.values, held_out=True)
         proposal = None if dry_run else propose(simulation, outcome, progress)
-        return Refined(outcome, noise, simulation, before, after, proposal)
+        return Refined(outcome, simulation, before, after, proposal)
 
 
 def twin_of(fitted: Fitted, throw: Throw, simulation: Simulation, old: Twin) -> Twin:

@@ -9,8 +9,8 @@ import numpy as np
 
 from masiv.effects.library import effect_named
 from masiv.refine.config import RefineConfig
-from masiv.refine.loop import Round
-from masiv.refine.model import effect_parameters
+from masiv.refine.loop import STOP_GAP, Round, excess
+from masiv.refine.model import Experiment, effect_parameters
 from masiv.refine.refit import Fitted, rms_mm, split
 from masiv.refine.score import Candidate
 from masiv.refine.stage import Refined
@@ -20,10 +20,10 @@ ADDED, NOTHING, UNEXPLAINED = "effect added", "nothing missing", "unexplained re
 
 def verdict(found: Refined, config: RefineConfig) -> str:
     """What the search came to."""
-    outcome = found.outcome
-    if outcome.after.model.effects:
-        return ADDED
-    return UNEXPLAINED if outcome.after.fit_mm > config.unexplained * outcome.floor.total else NOTHING
+    after = found.outcome.after
+    if excess(after, found.simulation.experiments) > config.unexplained:
+        return UNEXPLAINED
+    return ADDED if after.model.effects else NOTHING
 
 
 def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str, Any]:
@@ -31,13 +31,19 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
     outcome = found.outcome
     first = outcome.rounds[0] if outcome.rounds else None
     proposal = found.proposal
+    experiments = found.simulation.experiments
+    experiment = experiments[0]
     return {
         "schema": 1,
-        "noise_floor_mm": found.noise_mm,
-        "grid_floor_mm": {"fit": outcome.floor.fit, "held_out": outcome.floor.held_out},
+        "noise_floor_mm": 1e3 * experiment.noise,
+        "grid_floor_mm": _grid_floor(experiment),
+        "residual_over_floor": {
+            "before": excess(outcome.before, experiments), "after": excess(outcome.after, experiments)
+        },
         "residual_mm": {"fit": outcome.before.fit_mm, "held_out": outcome.before.held_out_mm},
         "candidates": [_candidate(c, first) for c in first.candidates] if first else [],
         "accepted": [_accepted(name, outcome.after) for name in outcome.after.model.effects],
+        "stop_gap": None if outcome.gap is None else _stop_gap(outcome.gap),
         "before": _errors(found, found.before),
         "after": _errors(found, found.after),
         "unexplained": unexplained(found),
@@ -53,6 +59,19 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
         },
         "rollouts": found.simulation.rollouts,
     }  # fmt: skip
+
+
+def _grid_floor(experiment: Experiment) -> dict[str, float | None]:
+    """What a finer grid changes, root mean square [mm] over the fitted and the held-out instants."""
+    grid = experiment.sigma**2 - experiment.noise**2
+    rest = grid[experiment.rows :]
+    fit = 1e3 * math.sqrt(max(float(grid[: experiment.rows].mean()), 0.0))
+    return {"fit": fit, "held_out": 1e3 * math.sqrt(max(float(rest.mean()), 0.0)) if len(rest) else None}
+
+
+def _stop_gap(fitted: Fitted) -> dict[str, Any]:
+    """A smooth force for what is unexplained; in no sense a cause."""
+    return {**_accepted(STOP_GAP, fitted), "fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}
 
 
 def _candidate(candidate: Candidate, first: Round) -> dict[str, Any]:
@@ -132,7 +151,7 @@ def unexplained(found: Refined) -> dict[str, Any]:
     where = (weight[:, None] * rest).sum(0) / max(weight.sum(), 1e-300)
     return {
         "rmse_mm": 1e3 * float(np.sqrt((size**2).mean())),
-        "noise_floor_mm": found.noise_mm,
+        "noise_floor_mm": 1e3 * experiment.noise,
         "worst_frame": (worst + 1) / problem.samples,
         "worst_frame_rmse_mm": float(by_instant[worst]),
         "rmse_mm_by_instant": by_instant.tolist(),
@@ -165,6 +184,10 @@ def text(document: dict[str, Any]) -> str:
         f"before {before['fit']['trajectory_rmse_mm']:.1f} mm{_held(before['held_out'].get('trajectory_rmse_mm'))}, "
         f"after {after['fit']['trajectory_rmse_mm']:.1f} mm{_held(after['held_out'].get('trajectory_rmse_mm'))}"
     )
+    gap = document["stop_gap"]
+    if gap is not None:
+        lines.append(f"a smooth force without a known cause would leave {gap['fit_rmse_mm']:.1f} mm"
+                     f"{_held(gap['held_out_rmse_mm'])}: a stop-gap, not an explanation")  # fmt: skip
     n = document["next_experiment"]
     if n is not None:
         lines.append(

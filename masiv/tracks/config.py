@@ -11,9 +11,6 @@ class TracksConfig(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     particles: int = Field(1700, ge=50, description="particles of the body")
-    finer_particles: int = Field(
-        3300, ge=0, description="particles of the rollout that tells what a finer grid changes"
-    )
     duration: float = Field(1.0, gt=0, description="how long after its release a run is fitted and judged [s]")
     search_duration: float = Field(
         0.1, gt=0, description="how long of it the first search for a law's scale looks at [s]; then twice that, and on"

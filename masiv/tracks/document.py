@@ -11,7 +11,7 @@ import numpy as np
 
 from masiv.effects.library import effect_named
 from masiv.refine.config import RefineConfig
-from masiv.refine.loop import Round
+from masiv.refine.loop import STOP_GAP, Round, excess
 from masiv.refine.refit import Fitted, rms_mm, split
 from masiv.refine.score import Candidate
 from masiv.refine.simulated import Term
@@ -31,17 +31,25 @@ def document(found: Found, config: RefineConfig, *, dry_run: bool) -> dict[str, 
     first = outcome.rounds[0] if outcome.rounds else None
     after = [found.simulation.term(n) for n in outcome.after.model.effects]
     new = [t for t in after if any(p.name in outcome.after.stderr for p in t.parameters)]
+    experiments = found.simulation.experiments
     verdict = ADDED if new else NOTHING
-    if not new and outcome.after.fit_mm > config.unexplained * outcome.floor.total:
+    if not new and excess(outcome.after, experiments) > config.unexplained:
         verdict = UNEXPLAINED
     return {
         "schema": 1,
         "condition": found.condition if isinstance(found, Refined) else None,
-        "noise_floor_mm": found.noise_mm,
-        "grid_floor_mm": {"fit": outcome.floor.fit, "held_out": outcome.floor.held_out},
+        "noise_floor_mm": 1e3 * float(np.mean([e.noise for e in experiments])),
+        "grid_floor_mm": {"fit": 0.0, "held_out": 0.0},
+        "residual_over_floor": {
+            "before": excess(outcome.before, experiments),
+            "after": excess(outcome.after, experiments),
+        },
         "residual_mm": {"fit": outcome.before.fit_mm, "held_out": outcome.before.held_out_mm},
         "candidates": [_candidate(found, c, first) for c in first.candidates] if first else [],
         "accepted": [_accepted(found, term) for term in new],
+        "stop_gap": None
+        if outcome.gap is None
+        else {"effect": STOP_GAP, "fit_rmse_mm": outcome.gap.fit_mm, "held_out_rmse_mm": outcome.gap.held_out_mm},
         "before": _errors(found, found.before),
         "after": _errors(found, found.after),
         "unexplained": _unexplained(found),
@@ -173,7 +181,7 @@ def _unexplained(found: Found) -> dict[str, Any]:
     instant, marker = np.unravel_index(int(size.argmax()), size.shape)
     return {
         "rmse_mm": rms_mm(found.after),
-        "noise_floor_mm": found.noise_mm,
+        "noise_floor_mm": 1e3 * run.noise,
         "worst_run": run.name,
         "worst_time_s": float(run.times[instant]),
         "worst_point": int(marker),

@@ -47,7 +47,6 @@ def runs_of(tracks: Tracks, condition: str) -> tuple[Run, ...]:
 
 def simulation_of(
     tracks: Tracks, condition: str, config: TracksConfig, simulator: SimulatorConfig, *, known: dict[str, float],
-    finer: bool = False,
 ) -> BodySimulation:  # fmt: skip
     """The runs of ``condition`` over the configured time."""
     body = only_body(tracks)
@@ -58,11 +57,10 @@ def simulation_of(
         spacing = (body.geometry.volume / particles) ** (1 / 3)
         return [body_run(tracks, run, simulator, spacing, config.duration) for run in runs_of(tracks, condition)]
 
-    fine = made(config.finer_particles) if finer and config.finer_particles > config.particles else []
     runs = made(config.particles)
     last = max(float(run.times[-1]) for run in runs)
     horizons = [h for k in range(16) if (h := config.search_duration * 2**k) < 0.9 * last]
-    return BodySimulation(tracks, runs, simulator, known=known, finer=fine, horizons=horizons)
+    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons)
 
 
 def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:

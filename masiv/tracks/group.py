@@ -13,14 +13,10 @@ from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
 from masiv.refine.loop import Outcome, close_loop, objections
 from masiv.refine.model import Model
-from masiv.refine.noise import floor_of
-from masiv.refine.refit import Fitted, full_fit
+from masiv.refine.refit import Fitted, full_fit, softness
 from masiv.refine.simulated import Term
 from masiv.tracks.points import RIGID, PointSimulation, point_runs
 from masiv.tracks.tracks import Tracks
-
-SMOOTH = 6
-"""Degree of the polynomial that stands for any smooth flight."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +36,6 @@ class GroupRefined:
     all, one strength each, came to for a body by itself: body -> reasons against it."""
 
     outcome: Outcome
-    noise_mm: float
     simulation: PointSimulation
     before: list[np.ndarray]
     after: list[np.ndarray]
@@ -63,18 +58,17 @@ def refine_group(
         if {run.fitted for run in simulation.experiments if run.body == body} != {True, False}:
             raise InputError(f"{tracks.path}: body {body} needs a run to fit and one with `use: hold_out` to judge by")
     base = baseline(simulation)
-    noise = flight_noise_mm(simulation)
     if dry_run:
-        searched = config.model_copy(update={"shortlist": 0, "above_noise": 1.0})
+        searched = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
     else:
         more = len(simulation.bodies)  # flights cost nothing: try all that a body may have of its own
         searched = config.model_copy(
             update={"max_effects": config.max_effects + more, "shortlist": config.shortlist + 2 * more}
         )
-    outcome = close_loop(simulation, [base], noise, searched, progress)
-    outcome, refused = confirmed(simulation, outcome, noise, config)
+    outcome = close_loop(simulation, [base], searched, progress)
+    outcome, refused = confirmed(simulation, outcome, config)
     fields = [simulation.fields(f.model, f.values, held_out=True) for f in (outcome.before, outcome.after)]
-    return GroupRefined(outcome, noise, simulation, fields[0], fields[1], refused, shared(simulation, outcome))
+    return GroupRefined(outcome, simulation, fields[0], fields[1], refused, shared(simulation, outcome))
 
 
 def baseline(
@@ -85,21 +79,8 @@ def baseline(
     return full_fit(simulation, model, values or {}, budget=12 * (len(simulation.parameters(model)) + 1))
 
 
-def flight_noise_mm(simulation: PointSimulation) -> float:
-    """Root mean square distance [mm] of the fitted flights from the nearest polynomial of degree ``SMOOTH``: what no
-    smooth motion explains, a lower bound of the noise."""
-    squares = []
-    for run in simulation.experiments:
-        if run.fitted and len(run.times) > 2 * SMOOTH:
-            t = run.times / run.times[-1]
-            basis = np.polynomial.chebyshev.chebvander(2 * t - 1, SMOOTH)
-            left = run.observed - basis @ np.linalg.lstsq(basis, run.observed, rcond=None)[0]
-            squares.append((left**2).sum() / (len(t) - SMOOTH - 1))
-    return 1e3 * float(np.sqrt(np.mean(squares))) if squares else 0.0
-
-
 def confirmed(
-    simulation: PointSimulation, outcome: Outcome, noise_mm: float, config: RefineConfig
+    simulation: PointSimulation, outcome: Outcome, config: RefineConfig
 ) -> tuple[Outcome, dict[str, list[str]]]:
     """``outcome`` where of an effect with one strength each only those bodies keep it whose own flights confirm it, by
     the loop's own rules; and the objections of the others. Standard errors are from each body's own flights."""
@@ -116,7 +97,7 @@ def confirmed(
                 p.name: max(after.values[q.name], p.step)
                 for p, q in zip(own.parameters, simulation.own(term, body), strict=True)
             }
-            found = _alone(simulation, body, others, {**after.values, **start}, own, noise_mm, config)
+            found = _alone(simulation, body, others, {**after.values, **start}, own, config)
             if isinstance(found, Fitted):
                 kept.append(own.name)
                 values |= found.values
@@ -125,7 +106,11 @@ def confirmed(
                 refused[body] = found
         model = replace(others, effects=(*others.effects, *kept))
         after = full_fit(
-            simulation, model, values, budget=3 * (len(simulation.parameters(model)) + 1), soft=outcome.soft
+            simulation,
+            model,
+            values,
+            budget=3 * (len(simulation.parameters(model)) + 1),
+            soft=soft_of(simulation, outcome),
         )
         after = replace(after, stderr={**after.stderr, **stderr})
     if not after.model.effects:
@@ -134,7 +119,7 @@ def confirmed(
 
 
 def _alone(
-    simulation: PointSimulation, body: str, others: Model, values: Mapping[str, float], own: Term, noise_mm: float,
+    simulation: PointSimulation, body: str, others: Model, values: Mapping[str, float], own: Term,
     config: RefineConfig,
 ) -> Fitted | list[str]:  # fmt: skip
     """The fit of ``own`` to the flights of ``body`` alone, or the reasons against it."""
@@ -144,9 +129,13 @@ def _alone(
         tried = baseline(one, others.with_effect(own.name), values)
     except MasivError as failed:
         return [str(failed)]
-    floor = floor_of(noise_mm, one, without)
-    reasons = [*objections(without, tried, own, floor, config), *one.objections(without, tried, own, config)]
+    reasons = [*objections(without, tried, own, one.experiments, config), *one.objections(without, tried, own, config)]
     return reasons or tried
+
+
+def soft_of(simulation: PointSimulation, outcome: Outcome) -> float:
+    """Size [m] from which a residual of the outcome counts as wild."""
+    return softness(simulation.residual(outcome.before.model, outcome.before.values))
 
 
 def shared(simulation: PointSimulation, outcome: Outcome) -> tuple[SharedFit, ...]:
@@ -166,7 +155,9 @@ def shared(simulation: PointSimulation, outcome: Outcome) -> tuple[SharedFit, ..
             for k, p in enumerate(one.parameters)
         }
         budget = 6 * (len(after.parameters) + 1)
-        fitted = full_fit(simulation, model, {**after.values, **start}, budget=budget, soft=outcome.soft)
+        fitted = full_fit(
+            simulation, model, {**after.values, **start}, budget=budget, soft=soft_of(simulation, outcome)
+        )
         out.append(SharedFit(effect, bodies, fitted, after.bic(after.samples) - fitted.bic(after.samples)))
     return tuple(out)
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from masiv.effects.effect import Effect, EffectParameter, Outline, Setting
-from masiv.effects.library import effect_named, effects
+from masiv.effects.library import causes, effect_named
 from masiv.errors import InputError, NonFiniteError
 from masiv.identify.families import Family
 from masiv.identify.parametric import Parameter
@@ -32,13 +32,16 @@ RIGID = Family("rigid", (), {})
 """The law of a body that does not deform: nothing to fit."""
 LONGEST_SUBSTEP = 5e-3
 EACH = "each"
+SMOOTH = 6
+"""Degree of the polynomial that stands for any smooth flight."""
 REFITS = 4
 """Gauss-Newton steps for the start of a run that is held out; without drag one is exact."""
 
 
 @dataclass(frozen=True)
 class PointRun:
-    """One run of a mass point. observed (K, A) [m, world] along ``axes`` at ``times`` (K,) [s] from the first on."""
+    """One run of a mass point. observed (K, A) [m, world] along ``axes`` at ``times`` (K,) [s] from the first on; noise
+    [m] of it, see ``flight_noise``; sigma (K,): see ``masiv.refine.simulated.Watched``."""
 
     name: str
     body: str
@@ -47,6 +50,16 @@ class PointRun:
     axes: tuple[int, ...]
     fitted: bool
     outline: Outline
+    noise: float
+    sigma: np.ndarray
+
+    @property
+    def instants(self) -> int:
+        return len(self.times)
+
+    def weighted(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, M, A) [m], less where the model itself is less certain."""
+        return field * (self.noise / self.sigma[: len(field), None, None])
 
     @property
     def rows(self) -> int:
@@ -101,7 +114,20 @@ def _point_run(tracks: Tracks, run: Run) -> PointRun:
     times = moving.times[seen]
     outline = outline_of(tracks, body)
     observed = moving.positions[seen][:, 0, list(axes)]
-    return PointRun(run.name, body.name, times - times[0], observed, axes, run.purpose == "fit", outline)
+    times = times - times[0]
+    noise = flight_noise(times, observed)
+    sigma = np.full(len(times), noise)
+    return PointRun(run.name, body.name, times, observed, axes, run.purpose == "fit", outline, noise, sigma)
+
+
+def flight_noise(times: np.ndarray, observed: np.ndarray) -> float:
+    """Root mean square distance [m] of a flight (K, A) from the nearest polynomial: what no smooth motion explains, a
+    lower bound of the noise. A flight of few frames hides it: a micrometre then stands for none."""
+    if len(times) <= 2 * SMOOTH:
+        return 1e-6
+    basis = np.polynomial.chebyshev.chebvander(2 * times / times[-1] - 1, SMOOTH)
+    left = observed - basis @ np.linalg.lstsq(basis, observed, rcond=None)[0]
+    return max(math.sqrt(float((left**2).sum()) / (len(times) - SMOOTH - 1)), 1e-6)
 
 
 def outline_of(tracks: Tracks, body: Body) -> Outline:
@@ -158,7 +184,7 @@ class PointSimulation:
     def candidates(self, model: Model) -> list[str]:
         """Effects of the surroundings once; those that depend on the body once for all, and once a body."""
         out, taken = [], [self.term(name) for name in model.effects]
-        for name, effect in effects().items():
+        for name, effect in causes().items():
             if effect.on_grid != "nodes" or any(p.unit == "m" for p in effect.parameters[effect.strengths :]):
                 continue  # what acts at a place is not told by a point that passes it once
             has = [t for t in taken if t.effect == name]
@@ -280,8 +306,9 @@ class PointSimulation:
         return out
 
     def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
-        """Of the fitted runs, flat."""
-        return np.concatenate([f.ravel() for f in self.fields(model, values)])
+        """Of the fitted runs, weighted, flat."""
+        found = zip(self.experiments, self.fields(model, values), strict=True)
+        return np.concatenate([run.weighted(f).ravel() for run, f in found])
 
     def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
         """What a quarter of the substep changes."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -32,7 +31,6 @@ class Refined:
     """Of one body: as ``GroupRefined``; condition: of the runs."""
 
     outcome: Outcome
-    noise_mm: float
     simulation: BodySimulation
     before: list[np.ndarray]
     after: list[np.ndarray]
@@ -167,31 +165,18 @@ def refine_tracks(
             acting = [e for e in twin.of(condition) if e.condition is None]
             effects = tuple(e.effect for e in acting)
             known = {**law, **{f"{e.effect}.{n}": v for e in acting for n, (v, _, _) in e.parameters.items()}}
-        simulation = simulation_of(
-            tracks, condition, config.tracks, config.simulator, known=known, finer=config.tracks.finer_particles > 0
-        )
+        simulation = simulation_of(tracks, condition, config.tracks, config.simulator, known=known)
         family = family_of(twin.law, only_body(tracks).density or 1e3, known)
         model = Model(family, "sticky" if simulation.ground else "none", effects)
         progress("refine: without effects", 0, 1)
         base = full_fit(simulation, model, values, budget=config.tracks.rollouts)
         progress("refine: without effects", 1, 1, f"{base.fit_mm:.2f} mm")
-        noise = marker_noise_mm(tracks, condition)
         searched = config.refine
         if dry_run:
-            searched = searched.model_copy(update={"shortlist": 0, "above_noise": 1.0})
-        outcome = close_loop(simulation, [base], noise, searched, progress)
+            searched = searched.model_copy(update={"shortlist": 0, "above_noise": 0.0})
+        outcome = close_loop(simulation, [base], searched, progress)
         before, after = (simulation.fields(f.model, f.values, held_out=True) for f in (outcome.before, outcome.after))
-        return Refined(outcome, noise, simulation, before, after, condition)
-
-
-def marker_noise_mm(tracks: Tracks, condition: str) -> float:
-    """Root mean square distance [mm] of markers from their mean while the fitted runs are at rest."""
-    squares = [
-        np.nansum(run.noise**2, axis=1).mean()
-        for run in runs_of(tracks, condition)
-        if run.purpose == "fit" and run.noise is not None
-    ]
-    return 1e3 * math.sqrt(float(np.mean(squares))) if squares else 0.0
+        return Refined(outcome, simulation, before, after, condition)
 
 
 def twin_after(twin: TracksTwin, found: Refined | GroupRefined) -> TracksTwin:

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.effect import EffectParameter, Outline, Setting
-from masiv.effects.library import effect_named, effects
+from masiv.effects.library import causes, effect_named
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.identify.parametric import Parameter
 from masiv.materials.classical import ClassicalLaw
@@ -45,7 +45,8 @@ BESIDE = 0.15
 @dataclass(frozen=True)
 class BodyRun:
     """A run from its release on: observed (K, M, 3) [m, world] of the markers tied to the body at ``times`` (K,) [s
-    since the release that the reader found], frames where one is not seen left out. speed [m/s]: their greatest."""
+    since the release that the reader found], frames where one is not seen left out. speed [m/s]: their greatest;
+    noise [m], sigma (K,): see ``masiv.refine.simulated.Watched``, the noise while the body is held."""
 
     name: str
     condition: str
@@ -54,6 +55,16 @@ class BodyRun:
     body: SimulatedBody
     fitted: bool
     speed: float
+    noise: float
+    sigma: np.ndarray
+
+    @property
+    def instants(self) -> int:
+        return len(self.times)
+
+    def weighted(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, M, A) [m], less where the model itself is less certain."""
+        return field * (self.noise / self.sigma[: len(field), None, None])
 
     @property
     def rows(self) -> int:
@@ -89,7 +100,9 @@ def body_run(tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, 
     observed = cut.positions[whole][:, markers]
     times = cut.elapsed[whole]
     speed = float(np.linalg.norm(np.diff(observed, axis=0), axis=2).max() / np.diff(times).min())
-    return BodyRun(run.name, run.condition, times, observed, body, run.purpose == "fit", speed)
+    noise = 1e-6 if run.noise is None else max(float(np.sqrt((run.noise[markers] ** 2).sum(1).mean())), 1e-6)
+    sigma = np.full(len(times), noise)
+    return BodyRun(run.name, run.condition, times, observed, body, run.purpose == "fit", speed, noise, sigma)
 
 
 class BodySimulation:
@@ -102,15 +115,13 @@ class BodySimulation:
         config: SimulatorConfig,
         *,
         known: Mapping[str, float] | None = None,
-        finer: Sequence[BodyRun] = (),
         horizons: Sequence[float] = (),
     ) -> None:
-        """runs: see ``body_run``; finer: the same with more particles, for what a finer grid changes; horizons [s]:
+        """runs: see ``body_run``; horizons [s]:
         after which a search may stop to look."""
         self.horizons = tuple(horizons)
         self.tracks = tracks
         self.experiments: Sequence[BodyRun] = tuple(runs)
-        self.finer = tuple(finer)
         self.config = config
         self.known = dict(known or {})
         self.outline: Outline = outline_of(tracks, next(iter(tracks.bodies.values())))
@@ -138,7 +149,7 @@ class BodySimulation:
         """Effects that ``model`` lacks; a clock that is off is a release at another time, and so is fitted already."""
         taken = not self.ground or any(effect_named(n).on_grid == "ground" for n in model.effects)
         out = []
-        for name, effect in effects().items():
+        for name, effect in causes().items():
             on_ground = effect.on_grid == "ground" or name == "ground_height"
             if name not in model.effects and name != "time_offset" and not (on_ground and taken):
                 out.append(name)
@@ -208,7 +219,12 @@ class BodySimulation:
     def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
         """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
         both = {**self.known, **values}
-        key = (id(run), model.effects, tuple(sorted((n, v) for n, v in both.items() if "@" not in n)))
+        key = (
+            run.name,
+            float(run.times[-1]),
+            model.effects,
+            tuple(sorted((n, v) for n, v in both.items() if "@" not in n)),
+        )
         if key in self.kept:
             return self.kept[key]
         last = float(run.times[-1]) + RELEASE_REACH
@@ -258,17 +274,13 @@ class BodySimulation:
         ]
 
     def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
-        """Of the fitted runs, flat."""
-        return np.concatenate([f.ravel() for f in self.fields(model, values)])
+        """Of the fitted runs, weighted, flat."""
+        found = zip(self.experiments, self.fields(model, values), strict=True)
+        return np.concatenate([run.weighted(f).ravel() for run, f in found])
 
     def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
-        """What more particles on their finer grid change."""
-        if not self.finer:
-            return None
-        run, fine = self.experiments[index], self.finer[index]
-        at = run.times - (values[run.release.name] if run.fitted else 0.0)
-        at = np.clip(at, 0.0, None)
-        return self.path(fine, model, values)(at) - self.path(run, model, values)(at)
+        """None: over many periods two grids are out of phase, which would hide all else. See benchmarks/measured.md."""
+        return None
 
     def early(self, base: Fitted) -> Sequence[BodySimulation]:
         """The first moments, then ever more, where the residual is as large as the swing: then the phase is lost."""
@@ -292,4 +304,4 @@ LAW_NAMES = frozenset({"youngs_modulus", "poissons_ratio", "yield_stress", "fric
 def shortened(run: BodyRun, duration: float) -> BodyRun:
     """The first ``duration`` [s] of a run."""
     kept = run.times <= duration
-    return replace(run, times=run.times[kept], observed=run.observed[kept])
+    return replace(run, times=run.times[kept], observed=run.observed[kept], sigma=run.sigma[kept])
