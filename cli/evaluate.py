@@ -13,8 +13,9 @@ from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgu
 def evaluate(
     run: RunArgument,
     truth: Annotated[
-        Path, typer.Option("--truth", help="Folder with particles_F.npy, (P, 3) metres a frame.", show_default=False)
-    ],
+        Path | None,
+        typer.Option("--truth", help="Folder with particles_F.npy, (P, 3) metres a frame; not for tracks."),
+    ] = None,
     config: ConfigOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
@@ -24,10 +25,19 @@ def evaluate(
     """Chamfer, tracked error, PSNR and SSIM beside rigid baselines; evaluate.json in the run folder.
 
     Example: `masiv evaluate runs/bunny --truth scenes/bunny/gt`
+
+    Tracks: errors of the runs, those that were held out apart: `masiv evaluate runs/beam`
     """
-    from . import stages
+    from masiv.errors import InputError
+
+    from . import stages, tracked
     from .console import progress_bar
 
+    if tracked.is_run(run):
+        tracked.refused(truth=truth)
+        return tracked.evaluate(*tracked.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch))
+    if truth is None:
+        raise InputError("--truth is missing: give the folder with particles_F.npy")
     folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
     folder.require("trajectory")
     stages.start(settings)

@@ -43,11 +43,18 @@ def identify(
 
     Example: `masiv identify scenes/bunny --out runs/bunny --preset quick --fit-frames 12`
 
+    A scene of tracks (measured points, no pictures) starts with the law: `masiv identify scenes/beam`
+
     A classical baseline: `masiv identify scenes/bunny --out runs/bunny-elastic --law neo_hookean`
     """
-    from . import stages
+    from . import stages, tracked
     from .console import progress_bar
 
+    if tracked.is_scene(scene):
+        tracked.refused(fit_frames=fit_frames, holdout_camera=holdout)
+        folder = out or Path("runs") / scene.resolve().name
+        opened = tracked.open_run(scene, folder, preset=preset, config=config, seed=seed, arch=arch, law=law)
+        return tracked.identify(*opened)
     run, settings, read = stages.open_run(
         scene,
         out or Path("runs") / scene.resolve().name,

@@ -16,6 +16,12 @@ def refine(
         Path | None,
         typer.Option("--second-run", help="Another throw of the same object: fitted jointly, and held out as well."),
     ] = None,
+    group: Annotated[
+        bool, typer.Option("--group", help="Tracks: bodies in flight that share physics, refined together.")
+    ] = False,
+    condition: Annotated[
+        str | None, typer.Option("--condition", help="Tracks: what do the runs of this condition lack besides?")
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rank the effects, fit none; changes no twin.")] = False,
     relearn: Annotated[
         bool,
@@ -32,10 +38,20 @@ def refine(
     What is accepted goes into twin.yaml (the old one is kept as twin.before.yaml), so that simulate uses it.
 
     Example: `masiv refine runs/torus --second-run runs/torus_seq1`
+
+    Tracks: `masiv refine runs/balls --group`, `masiv refine runs/beam --condition load`
     """
-    from . import stages
+    from masiv.errors import InputError
+
+    from . import stages, tracked
     from .console import progress_bar
 
+    if tracked.is_run(run):
+        tracked.refused(second_run=second)
+        opened = tracked.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
+        return tracked.refine(*opened, group=group, condition=condition, dry_run=dry_run)
+    if group or condition is not None:
+        raise InputError(f"{run} is of a scene of pictures: --group and --condition are for tracks")
     folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
     folder.require("identify")
     runs = [(run, folder, scene)]

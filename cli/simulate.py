@@ -44,6 +44,9 @@ def simulate(
         typer.Option("--without", metavar="EFFECT", help="Leave out an effect of the twin; may be repeated."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Where to write. [default: RUN/simulate]")] = None,
+    condition: Annotated[
+        str | None, typer.Option("--condition", help="Tracks: with what acts in the runs of this condition.")
+    ] = None,
     render: Annotated[bool, typer.Option("--render", help="Also draw views/*.png and video.mp4.")] = False,
     view: Annotated[
         list[int] | None, typer.Option("--view", help="Camera to draw; may be repeated. [default: 0]")
@@ -62,9 +65,26 @@ def simulate(
     """
     from masiv.errors import InputError
 
-    from . import stages
+    from . import stages, tracked
     from .console import progress_bar
 
+    if tracked.is_run(run):
+        tracked.refused(
+            velocity=velocity, omega=omega, law=law, blend=blend, geometry=geometry, density=density, ground=ground,
+            force=force, force_from=force_from, force_until=force_until, render=render, view=view,
+        )  # fmt: skip
+        opened = tracked.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
+        pull = vector(gravity, "--gravity")
+        return tracked.simulate(
+            *opened,
+            frames=frames,
+            gravity=pull,
+            without=without or [],
+            condition=condition,
+            out=out or run / "simulate",
+        )
+    if condition is not None:
+        raise InputError(f"{run} is of a scene of pictures: --condition is for tracks")
     thrown = vector(velocity, "--velocity"), vector(omega, "--omega"), vector(gravity, "--gravity")
     folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
     folder.require("identify")

@@ -17,6 +17,7 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.refine.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
 from masiv.strict import read_yaml, validated
+from masiv.tracks.config import TracksConfig
 
 Preset = Literal["quick", "standard", "paper"]
 DEFAULT_PRESET = "standard"
@@ -34,6 +35,7 @@ class Config(BaseModel):
     simulator: SimulatorConfig = SimulatorConfig.model_validate({})
     identify: IdentifyConfig = IdentifyConfig.model_validate({})
     refine: RefineConfig = RefineConfig.model_validate({})
+    tracks: TracksConfig = TracksConfig.model_validate({})
 
 
 def load_config(

@@ -29,7 +29,11 @@ from masiv.strict import read_yaml
 SCHEMA = 1
 STAGES = ("reconstruct", "trajectory", "identify")
 # The parts of the configuration that change what a stage makes. Stages later in STAGES depend on all the earlier ones.
-SECTIONS = {"reconstruct": ("reconstruct",), "trajectory": ("trajectory",), "identify": ("simulator", "identify")}
+SECTIONS = {
+    "reconstruct": ("reconstruct",),
+    "trajectory": ("trajectory",),
+    "identify": ("simulator", "identify", "tracks"),
+}
 PENDING, RUNNING, DONE = "pending", "running", "done"
 
 

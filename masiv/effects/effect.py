@@ -40,6 +40,17 @@ class Setting:
     path: torch.Tensor | None = None
 
 
+@dataclass(frozen=True)
+class Outline:
+    """A body as the medium that it moves through sees it: diameter [m], mass [kg]; density [kg/m^3] and viscosity
+    [Pa s] of the medium."""
+
+    diameter: float
+    mass: float
+    medium_density: float
+    medium_viscosity: float
+
+
 class Effect(ABC):
     """One effect; a subclass a file in ``masiv/effects``, found there by ``masiv.effects.library``.
 
@@ -56,6 +67,20 @@ class Effect(ABC):
     on_stress: ClassVar[bool] = False
     cause: ClassVar[bool] = True
     """False for a stop-gap, which no search may name."""
+
+    of_body: ClassVar[bool] = False
+    """Whether the strength depends on the body (a drag), so that bodies may differ; else it is that of the
+    surroundings, one for all that move in them."""
+    shared: ClassVar[tuple[EffectParameter, ...] | None] = None
+    """The strength as bodies of different size and mass may share it, see ``of``; None: as it is."""
+
+    def of(self, theta: torch.Tensor, body: Outline) -> torch.Tensor:
+        """Values of ``shared`` (P,) -> the parameters of ``body`` (P,)."""
+        return theta
+
+    def contradiction(self, theta: torch.Tensor, body: Outline) -> str | None:
+        """Why values of ``shared`` (P,) cannot be, given what is known of the body and the medium."""
+        return None
 
     def node_velocity(self) -> Callable[..., Any]:
         """Taichi function (x, v, held, t, dt, dx, c) -> v, see ``masiv.kernels.effects.NodeKernels``."""

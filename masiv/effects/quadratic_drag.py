@@ -1,5 +1,7 @@
 """Drag that grows with the square of speed."""
 
+import math
+
 import taichi as ti
 
 from masiv.effects.effect import Effect, EffectParameter
@@ -18,6 +20,12 @@ class QuadraticDrag(Effect):
     looks_like = "fast parts slow down most: a throw loses speed early, a slow spin hardly changes"
     parameters = (EffectParameter("coefficient", "1/m", 0.0, 20.0, 0.02),)
     on_grid = "nodes"
+    of_body = True
+    shared = (EffectParameter("drag_coefficient", "1", 0.0, 3.0, 0.05),)
+
+    def of(self, theta, body):
+        """C_d -> c, with A that of a sphere."""
+        return theta * (body.medium_density * math.pi * body.diameter**2 / (8 * body.mass))
 
     def node_velocity(self):
         return _slowed

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from masiv.effects.library import effect_named
 from masiv.errors import MasivError
 from masiv.refine.config import RefineConfig
-from masiv.refine.model import Experiment, Simulation, effect_parameters, parameters
 from masiv.refine.noise import uncertainty
 from masiv.refine.refit import Fitted, chord_fit, column, full_fit, reweighted, softness, summarised
 from masiv.refine.score import Candidate, alike, score
+from masiv.refine.simulated import Simulated, Term, Watched
 
 Say = Callable[[str, int, int, str], None]
 CHORD_STEPS = 8
@@ -62,7 +61,7 @@ class Outcome:
     gap: Fitted | None = None
 
 
-def close_loop(simulation: Simulation, baselines: Sequence[Fitted], config: RefineConfig, say: Say) -> Outcome:
+def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: RefineConfig, say: Say) -> Outcome:
     """Add effects to the best of ``baselines`` (one a law, without effects) until none is confirmed, or the residual is
     near what noise and grid explain. Gives the experiments of ``simulation`` their sigma."""
     least = min(baselines, key=lambda f: f.cost)
@@ -96,7 +95,7 @@ def close_loop(simulation: Simulation, baselines: Sequence[Fitted], config: Refi
     return Outcome(before, current, rounds, gap)
 
 
-def stop_gap(simulation: Simulation, current: Fitted, soft: float, config: RefineConfig, say: Say) -> Fitted | None:
+def stop_gap(simulation: Simulated, current: Fitted, soft: float, config: RefineConfig, say: Say) -> Fitted | None:
     """``current`` with a smooth force that stands in for what is not known; None where held-out data does not bear it
     out."""
     label = "refine: a smooth force for the rest"
@@ -109,10 +108,11 @@ def stop_gap(simulation: Simulation, current: Fitted, soft: float, config: Refin
         say(label, 1, 1, str(failed))
         return None
     say(label, 1, 1, f"{fitted.fit_mm:.1f} mm")
-    return None if objections(current, fitted, STOP_GAP, simulation.experiments, config) else fitted
+    term = simulation.term(STOP_GAP)
+    return None if objections(current, fitted, term, simulation.experiments, config) else fitted
 
 
-def weigh(simulation: Simulation, fitted: Fitted) -> None:
+def weigh(simulation: Simulated, fitted: Fitted) -> None:
     """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves."""
     model, values = fitted.model, fitted.values
     simulation.experiments = tuple(
@@ -120,14 +120,14 @@ def weigh(simulation: Simulation, fitted: Fitted) -> None:
     )
 
 
-def excess(fitted: Fitted, experiments: Sequence[Experiment]) -> float:
+def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:
     """Root mean square residual over the fitted instants in units of sigma, in the phase of the motion (well known, or
     not) where it is largest: about 1 where nothing is missing."""
     return math.sqrt(max(_phases([s / e.sigma**2 for s, e in zip(fitted.squares, experiments, strict=True)],
                                  experiments)))  # fmt: skip
 
 
-def _phases(ratios: Sequence[np.ndarray], experiments: Sequence[Experiment]) -> list[float]:
+def _phases(ratios: Sequence[np.ndarray], experiments: Sequence[Watched]) -> list[float]:
     """Means of ``ratios`` (K,) over fitted instants whose sigma is hardly more than the noise, and over the others."""
     known, rest = [], []
     for ratio, e in zip(ratios, experiments, strict=True):
@@ -146,7 +146,7 @@ def ordered(fits: Sequence[Fitted]) -> list[Fitted]:
 
 
 def _round(
-    simulation: Simulation,
+    simulation: Simulated,
     current: Fitted,
     bases: Sequence[Fitted],
     soft: float,
@@ -161,8 +161,10 @@ def _round(
         names = [c.effect for c in ranking if c.explained >= config.least_explained][: config.shortlist]
         if ranking and not names:
             break
+        early = simulation.early(base)
+        start = base if not early else _carried(early[0], base, soft)
         candidates = score(
-            simulation, base, soft=soft, names=names or config.effects or None,
+            early[0] if early else simulation, start, soft=soft, names=names or config.effects or None,
             progress=lambda n, i, k, label=label: say(label, i, k, n),
         )  # fmt: skip
         say(label, 1, 1, candidates[0].effect if candidates else "none")
@@ -172,7 +174,10 @@ def _round(
             label = f"refine: fit effects, {base.model.family.kind}"
             say(label, done, len(worth), candidate.effect)
             try:
-                trials.append(Trial(candidate, refit(simulation, base, candidate, soft)))
+                fitted = refit(early[0] if early else simulation, start, candidate, soft)
+                for longer in (*early[1:], simulation) if early else ():
+                    fitted = _carried(longer, fitted, soft)
+                trials.append(Trial(candidate, fitted))
             except MasivError as failed:
                 say(label, done, len(worth), f"{candidate.effect}: {failed}")
         if worth:
@@ -182,7 +187,7 @@ def _round(
     confusable = _confusable(ranking, trials, config.confusable)
     accepted = None
     for trial in trials:
-        trial.reasons = objections(current, trial.fitted, trial.candidate.effect, simulation.experiments, config)
+        trial.reasons = _reasons(simulation, current, trial, config)
     for k, trial in enumerate(t for t in trials if t.passes):
         if k > 0:
             break
@@ -191,22 +196,27 @@ def _round(
             budget=2 * len(trial.fitted.parameters) + 6, soft=soft,
         )  # fmt: skip
         trial.fitted = min(final, trial.fitted, key=lambda f: f.cost)
-        trial.reasons = objections(current, trial.fitted, trial.candidate.effect, simulation.experiments, config)
+        trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
 
 
-def refit(simulation: Simulation, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
+def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
+    """``fitted`` as a start in another simulation of the same experiments."""
+    budget = 2 * (len(fitted.parameters) + 1)
+    return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft)
+
+
+def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
     """``base`` with the effect: strengths jointly with law and throw; then its places or frequencies as well."""
-    effect = effect_named(candidate.effect)
-    model = base.model.with_effect(effect.name)
-    params = parameters(model, simulation.experiments)
+    term = simulation.term(candidate.effect)
+    model = base.model.with_effect(term.name)
+    params = simulation.parameters(model)
     names = [p.name for p in params]
-    own = effect_parameters(effect.name)
-    first = [p for p in params if p not in own[effect.strengths :]]
-    jacobian = _assembled(first, base, candidate, [p.name for p in own[: effect.strengths]])
-    others = {p.name: candidate.theta[p.name] for p in own[effect.strengths :]}
-    values = {**base.values, **{p.name: 0.0 for p in own[: effect.strengths]}, **others}
+    first = [p for p in params if p not in term.others]
+    jacobian = _assembled(first, base, candidate, [p.name for p in term.strengths])
+    others = {p.name: candidate.theta[p.name] for p in term.others}
+    values = {**base.values, **{p.name: 0.0 for p in term.strengths}, **others}
     values, residual, jacobian = chord_fit(
         simulation, model, first, values, base.residual, jacobian, steps=CHORD_STEPS, soft=soft
     )
@@ -229,10 +239,16 @@ def _assembled(first, base: Fitted, candidate: Candidate, strengths: list[str]) 
     return np.stack([known[p.name] for p in first], axis=1)
 
 
+def _reasons(simulation: Simulated, before: Fitted, trial: Trial, config: RefineConfig) -> list[str]:
+    term = simulation.term(trial.candidate.effect)
+    general = objections(before, trial.fitted, term, simulation.experiments, config)
+    return [*general, *simulation.objections(before, trial.fitted, term, config)]
+
+
 def objections(
-    before: Fitted, after: Fitted, effect: str, experiments: Sequence[Experiment], config: RefineConfig
+    before: Fitted, after: Fitted, term: Term, experiments: Sequence[Watched], config: RefineConfig
 ) -> list[str]:
-    """Why ``effect`` is not accepted; empty where it is."""
+    """Why ``term`` is not accepted; empty where it is."""
     out = []
     gained = [
         (b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)
@@ -244,18 +260,17 @@ def objections(
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
     out += _held_out(before, after, gained, experiments, config)
-    strengths = effect_parameters(effect)[: effect_named(effect).strengths]
-    sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in strengths))
+    sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in term.strengths))
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
-    for p in effect_parameters(effect):
+    for p in term.parameters:
         if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper):
             out.append(f"{p.name} runs into the bound of what is possible, {p.upper:g}")
     return out
 
 
 def _held_out(
-    before: Fitted, after: Fitted, gained: Sequence[np.ndarray], experiments: Sequence[Experiment], config: RefineConfig
+    before: Fitted, after: Fitted, gained: Sequence[np.ndarray], experiments: Sequence[Watched], config: RefineConfig
 ) -> list[str]:
     """What the held-out instants, weighted as the others, say against ``after``."""
     rest = [k for k, e in enumerate(experiments) if e.holds_out]

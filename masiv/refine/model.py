@@ -9,11 +9,12 @@ import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.library import effect_named
+from masiv.effects.library import causes, effect_named
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.identify.families import Family, law_of, motion_of, motion_parameters
 from masiv.identify.parametric import Parameter
 from masiv.identify.problem import Motion, Problem
+from masiv.refine.simulated import Term, effect_parameters, plain_term
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,16 @@ class Experiment:
     def holds_out(self) -> bool:
         return self.fitted - 1 < self.problem.frames
 
+    @property
+    def instants(self) -> int:
+        """All of them."""
+        return self.problem.frames * self.problem.samples
+
+    @property
+    def places(self) -> np.ndarray:
+        """Particles at frame 0 (N, 3) [m, simulation frame]."""
+        return self.problem.start.double().numpy()
+
 
 @dataclass(frozen=True)
 class Model:
@@ -58,14 +69,6 @@ class Model:
 
     def with_effect(self, name: str) -> Model:
         return replace(self, effects=(*self.effects, name))
-
-
-def effect_parameters(name: str) -> tuple[Parameter, ...]:
-    """The parameters of an effect, named ``effect.parameter``."""
-    return tuple(
-        Parameter(f"{name}.{p.name}", float(np.clip(p.start, p.lower, p.upper)), p.lower, p.upper, p.step)
-        for p in effect_named(name).parameters
-    )
 
 
 def parameters(model: Model, experiments: Sequence[Experiment]) -> tuple[Parameter, ...]:
@@ -107,6 +110,28 @@ class Simulation:
         self.experiments = tuple(experiments)
         self.steps: dict[tuple[int, str], int] = {}
         self.rollouts = 0
+
+    def parameters(self, model: Model) -> tuple[Parameter, ...]:
+        """See ``parameters``."""
+        return parameters(model, self.experiments)
+
+    def candidates(self, model: Model) -> list[str]:
+        """Effects that ``model`` lacks; one contact with the ground at most, and none where there is no ground."""
+        library = causes()
+        taken = model.contact == "none" or any(effect_named(n).on_grid == "ground" for n in model.effects)
+        return [n for n, e in library.items() if n not in model.effects and not (taken and e.on_grid == "ground")]
+
+    def term(self, name: str) -> Term:
+        """The effect, of all that is filmed; its guesses are of the first experiment."""
+        return plain_term(name, self.experiments[0].problem.setting())
+
+    def early(self, base) -> list:
+        """None: a fall is short."""
+        return []
+
+    def objections(self, before, after, term, config) -> list[str]:
+        """None but those of the loop."""
+        return []
 
     @torch.no_grad()
     def positions(self, model: Model, values: Mapping[str, float], index: int, frames: int) -> torch.Tensor:

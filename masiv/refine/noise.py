@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from masiv.refine.model import Model, Simulation
+from masiv.refine.model import Model
+from masiv.refine.simulated import Simulated
 
 
 def noise_floor(positions: np.ndarray, last_frame: int) -> float:
@@ -25,7 +26,7 @@ def noise_floor(positions: np.ndarray, last_frame: int) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def uncertainty(simulation: Simulation, model: Model, values: dict[str, float], index: int) -> np.ndarray:
+def uncertainty(simulation: Simulated, model: Model, values: dict[str, float], index: int) -> np.ndarray:
     """Root mean square distance (K,) [m] by which model and observation of experiment ``index`` may differ at each
     instant with nothing missing: noise, and what a finer grid changes. In free flight that is the noise alone.
 
@@ -33,6 +34,5 @@ def uncertainty(simulation: Simulation, model: Model, values: dict[str, float], 
     """
     experiment = simulation.experiments[index]
     change = simulation.finer_grid(model, values, index)
-    instants = experiment.problem.frames * experiment.problem.samples
-    grid = np.zeros(instants) if change is None else np.sqrt((change**2).sum(2).mean(1))
+    grid = np.zeros(experiment.instants) if change is None else np.sqrt((change**2).sum(2).mean(1))
     return np.hypot(experiment.noise, np.maximum.accumulate(grid))

@@ -11,7 +11,8 @@ import numpy as np
 from masiv.errors import NonFiniteError
 from masiv.identify.correlation import effective_samples
 from masiv.identify.parametric import FIRST_STEP, Parameter, covariance, fit_parameters, robust_weight
-from masiv.refine.model import Experiment, Model, Simulation, parameters
+from masiv.refine.model import Model
+from masiv.refine.simulated import Simulated, Watched
 
 LEAST_GAIN = 1e-3
 
@@ -59,7 +60,7 @@ def rms_mm(fields: Sequence[np.ndarray]) -> float:
     return 1e3 * float(np.sqrt(squares.mean()))
 
 
-def split(fields: Sequence[np.ndarray], experiments: Sequence[Experiment]) -> tuple[list, list]:
+def split(fields: Sequence[np.ndarray], experiments: Sequence[Watched]) -> tuple[list, list]:
     """Fitted and held-out instants of fields over all frames."""
     fit = [f[: e.rows] for f, e in zip(fields, experiments, strict=True)]
     return fit, [f[e.rows :] for f, e in zip(fields, experiments, strict=True) if e.holds_out]
@@ -75,7 +76,7 @@ def moved(params: Sequence[Parameter], values: Mapping[str, float], step: np.nda
 
 
 def column(
-    simulation: Simulation, model: Model, values: Mapping[str, float], residual: np.ndarray, p: Parameter
+    simulation: Simulated, model: Model, values: Mapping[str, float], residual: np.ndarray, p: Parameter
 ) -> np.ndarray:
     """Derivative (M,) of the residual with respect to ``p``, by a finite difference into the bounds."""
     here = p.fitted(values[p.name])
@@ -93,7 +94,7 @@ def column(
 
 
 def chord_fit(
-    simulation: Simulation,
+    simulation: Simulated,
     model: Model,
     params: Sequence[Parameter],
     values: Mapping[str, float],
@@ -142,9 +143,9 @@ def chord_fit(
     return values, residual, jacobian
 
 
-def reweighted(simulation: Simulation, base: Fitted, *, steps: int, soft: float) -> Fitted:
+def reweighted(simulation: Simulated, base: Fitted, *, steps: int, soft: float) -> Fitted:
     """``base`` fitted again to the residual as ``simulation`` weighs it now; fresh derivatives before and after."""
-    params = started(parameters(base.model, simulation.experiments), base.values)
+    params = started(simulation.parameters(base.model), base.values)
     values = dict(base.values)
     residual = simulation.residual(base.model, values)
     for take in (steps, 0):
@@ -167,7 +168,7 @@ def _free(params: Sequence[Parameter], values: Mapping[str, float], downhill: np
 
 
 def summarised(
-    simulation: Simulation,
+    simulation: Simulated,
     model: Model,
     params: Sequence[Parameter],
     values: Mapping[str, float],
@@ -181,8 +182,7 @@ def summarised(
     weighted = [e.weighted(f) for f, e in zip(fit, simulation.experiments, strict=True)]
     residual = np.concatenate([f.ravel() for f in weighted])
     samples = sum(
-        effective_samples(f, e.problem.start.double().numpy())
-        for f, e in zip(weighted, simulation.experiments, strict=True)
+        effective_samples(f, e.places) for f, e in zip(weighted, simulation.experiments, strict=True) if e.rows
     )
     weight = robust_weight(residual, soft)
     spread = np.diag(covariance(jacobian * weight[:, None], residual * weight))
@@ -200,10 +200,10 @@ def summarised(
 
 
 def full_fit(
-    simulation: Simulation, model: Model, values: Mapping[str, float], *, budget: int, soft: float | None = None
+    simulation: Simulated, model: Model, values: Mapping[str, float], *, budget: int, soft: float | None = None
 ) -> Fitted:
     """Gauss-Newton with fresh derivatives from ``values`` (defaults where missing), and standard errors."""
-    params = started(parameters(model, simulation.experiments), values)
+    params = started(simulation.parameters(model), values)
     estimate = fit_parameters(
         lambda v: simulation.residual(model, v), params, max_evaluations=budget, robust=True, tolerance=LEAST_GAIN
     )

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from masiv.effects.effect import Effect
-from masiv.effects.library import causes, effects
 from masiv.errors import NonFiniteError
 from masiv.identify.parametric import robust_weight
-from masiv.refine.model import Simulation, effect_parameters
 from masiv.refine.refit import Fitted
+from masiv.refine.simulated import Simulated, Term
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class Candidate:
 
 
 def score(
-    simulation: Simulation,
+    simulation: Simulated,
     base: Fitted,
     *,
     soft: float,
@@ -45,18 +43,13 @@ def score(
     weight = robust_weight(base.residual, soft)
     nuisance = _basis(base.jacobian * weight[:, None])
     left = _without(nuisance, base.residual * weight)
-    library = effects()
-    setting = simulation.experiments[0].problem.setting()
-    on_ground = any(library[n].on_grid == "ground" for n in base.model.effects)
     found = []
-    todo = [n for n in (names or causes()) if n not in base.model.effects]
+    todo = [n for n in (names or simulation.candidates(base.model)) if n not in base.model.effects]
     for done, name in enumerate(todo):
         if progress is not None:
             progress(name, done, len(todo))
-        effect = library[name]
-        if effect.on_grid == "ground" and (on_ground or base.model.contact == "none"):
-            continue
-        tried = [_tried(simulation, base, effect, guess, weight, nuisance, left) for guess in effect.guesses(setting)]
+        term = simulation.term(name)
+        tried = [_tried(simulation, base, term, guess, weight, nuisance, left) for guess in term.guesses]
         known = [t for t in tried if t is not None]
         if known:
             found.append(max(known, key=lambda c: c.explained))
@@ -64,13 +57,12 @@ def score(
 
 
 def _tried(
-    simulation: Simulation, base: Fitted, effect: Effect, guess: tuple[float, ...], weight: np.ndarray,
+    simulation: Simulated, base: Fitted, term: Term, guess: tuple[float, ...], weight: np.ndarray,
     nuisance: np.ndarray, left: np.ndarray,
 ) -> Candidate | None:  # fmt: skip
     """The effect with its places, frequencies… at ``guess``; None where its rollouts diverge."""
-    model = base.model.with_effect(effect.name)
-    params = effect_parameters(effect.name)
-    strengths, others = params[: effect.strengths], params[effect.strengths :]
+    model = base.model.with_effect(term.name)
+    strengths, others = term.strengths, term.others
     fixed = {p.name: value for p, value in zip(others, guess, strict=True)}
     absent = {**base.values, **{p.name: 0.0 for p in strengths}, **fixed}
     columns = []
@@ -89,7 +81,7 @@ def _tried(
     share = len(left) / max(base.samples, 1)
     spread = np.linalg.pinv(s_left.T @ s_left) * per_sample * share * base.samples / len(left)
     return Candidate(
-        effect.name,
+        term.name,
         max(explained, 0.0),
         {**{p.name: float(t) for p, t in zip(strengths, theta, strict=True)}, **fixed},
         {p.name: float(np.sqrt(max(v, 0.0))) for p, v in zip(strengths, np.diag(spread), strict=True)},

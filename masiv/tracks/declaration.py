@@ -147,7 +147,8 @@ class TracksDeclaration(_Part):
 
     units: of positions in the files, where they do not say it (a CSV by columns such as tip_x_mm). rate [Hz]: where
     files have no time. up_axis (z by default), gravity (9.8 down by default), ground (none by default): as of a scene
-    of pictures.
+    of pictures. medium_density [kg/m³] and
+    medium_viscosity [Pa s]: of what bodies move through, air at 20 °C by default.
     """
 
     layout: Literal["tracks"]
@@ -156,6 +157,8 @@ class TracksDeclaration(_Part):
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | Vector | None = None
     gravity: FiniteFloat | Vector | None = None
     ground: Literal["none"] | GroundDeclaration | None = None
+    medium_density: Positive = 1.2
+    medium_viscosity: Positive = 1.8e-5
     columns: ColumnsDeclaration | None = None
     bodies: dict[str, BodyDeclaration] = Field(min_length=1)
     runs: tuple[RunDeclaration, ...] = Field(min_length=1)

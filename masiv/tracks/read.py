@@ -53,6 +53,8 @@ def read_tracks(folder: Path) -> Tracks:
         bodies=bodies,
         runs=runs,
         problems=tuple(problems),
+        medium_density=declared.medium_density,
+        medium_viscosity=declared.medium_viscosity,
     )
 
 

@@ -105,7 +105,8 @@ class Run:
 
 @dataclass(frozen=True)
 class Tracks:
-    """A scene of measured points. up (3,) unit; gravity (3,) [m/s²]; ground: the plane, or None."""
+    """A scene of measured points. up (3,) unit; gravity (3,) [m/s²]; ground: the plane, or None; medium_density
+    [kg/m³] and medium_viscosity [Pa s]: of what the bodies move through."""
 
     path: Path
     up: np.ndarray
@@ -114,6 +115,8 @@ class Tracks:
     bodies: dict[str, Body]
     runs: tuple[Run, ...]
     problems: tuple[str, ...] = ()
+    medium_density: float = 1.2
+    medium_viscosity: float = 1.8e-5
 
     layout = "tracks"
 

@@ -1,0 +1,182 @@
+"""Real measurements: falling balls and a silicone beam, from tracks to what the model lacks.
+
+    python benchmarks/measured.py scenes --out DIR        # scenes that masiv reads, one folder each
+    python benchmarks/measured.py balls [--json FILE]
+
+The measurements are in the folder that MASIV_MEASURED names, ../shared/measured beside the repository by default. They
+are public: see benchmarks/measured.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import yaml
+
+OUNCE = 0.028349523125
+MARKERS_AT = {"tip1": [36, 15, 0], "tip2": [24, -6, 0], "tip3": [6, 36, 0],
+              "base1": [-1, -10, 94], "base2": [27.5, 40, 94], "base3": [0, 40, 94]}  # fmt: skip
+"""Of the beam [mm], in the axes of its mesh; the clamped end is at z = 100. Fitted to the rest positions."""
+
+
+BEAM_AT_REST = {("gravity", "a"): [20, 60], ("gravity", "b"): [20, 55],
+                ("load52", "a"): [10, 35], ("load52", "b"): [10, 45]}  # fmt: skip
+"""Frames in which the beam is held straight."""
+
+
+def data_folder() -> Path:
+    """Where the measurements are, whether or not they are there."""
+    return Path(os.environ.get("MASIV_MEASURED", Path(__file__).parents[2] / "shared" / "measured"))
+
+
+def write_balls(source: Path, out: Path) -> Path:
+    """A scene of the ball drops in ``source``: drop 1 of each ball is fitted, drop 2 held out."""
+    out.mkdir(parents=True, exist_ok=True)
+    _link(source / "ball_drops.csv", out)
+    bodies, runs = {}, []
+    with (source / "balls.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            name = row["ball"]
+            bodies[name] = {
+                "mass": float(row["weight_oz"]) * OUNCE,
+                "group": "balls",
+                "geometry": {
+                    "sphere": float(row["circumference_cm"]) / math.pi, "units": "cm",
+                    "markers_at": {"centre": [0, 0, 0]},
+                },
+            }  # fmt: skip
+            runs += [
+                {"file": "ball_drops.csv", "body": name, "select": {"ball": name, "drop": drop},
+                 "use": "fit" if drop == 1 else "hold_out"}
+                for drop in (1, 2)
+            ]  # fmt: skip
+    _save(out, {
+        "layout": "tracks", "units": "m", "up_axis": "y",
+        "columns": {"time": "time_s", "markers": {"centre": {"y": "height_m"}}}, "bodies": bodies, "runs": runs,
+    })  # fmt: skip
+    return out
+
+
+def write_beam(source: Path, out: Path) -> Path:
+    """A scene of the silicone beam in ``source``: _a is fitted, _b held out, under its own weight and with a load."""
+    out.mkdir(parents=True, exist_ok=True)
+    _link(source / "beam.stl", out)
+    runs = []
+    for kind, condition in (("gravity", ""), ("load52", "load52")):
+        for repeat, use in (("a", "fit"), ("b", "hold_out")):
+            name = f"beam_{kind}_V2_{repeat}.csv"
+            _link(source / name, out)
+            runs.append({"file": name, "name": f"{kind}_{repeat}", "condition": condition, "use": use,
+                         "rest_frames": BEAM_AT_REST[kind, repeat]})  # fmt: skip
+    body = {
+        "density": 1070,
+        "poissons_ratio": 0.499,
+        "geometry": {"mesh": "beam.stl", "units": "mm", "markers_at": MARKERS_AT},
+        "clamp": {"half_space": {"normal": [0, 0, -1], "height": -100}, "markers": ["base1", "base2", "base3"]},
+    }
+    _save(out, {"layout": "tracks", "units": "m", "up_axis": "x", "bodies": {"beam": body}, "runs": runs})
+    return out
+
+
+def _link(file: Path, folder: Path) -> None:
+    if not (folder / file.name).exists():
+        (folder / file.name).symlink_to(file.resolve())
+
+
+def _save(folder: Path, document: dict) -> None:
+    (folder / "scene.yaml").write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+
+
+def ball_scene(source: Path):
+    """The ``Tracks`` of the ball drops in ``source``."""
+    from masiv.tracks.read import read_tracks
+
+    with tempfile.TemporaryDirectory() as folder:
+        return read_tracks(write_balls(source, Path(folder)))
+
+
+def balls(source: Path) -> dict:
+    """What refine finds in the ball drops, and what one free gravity a ball would have looked like."""
+    from masiv.refine.config import RefineConfig
+    from masiv.tracks.group import refine_group, unlike
+
+    tracks = ball_scene(source)
+    began = time.perf_counter()
+    found = refine_group(tracks, "balls", RefineConfig.model_validate({}))
+    seconds = time.perf_counter() - began
+    simulation, outcome = found.simulation, found.outcome
+    first = {t.candidate.effect: t for t in outcome.rounds[0].trials}
+    alike = simulation.by_body
+    rows = {
+        "before": alike(outcome.before.model, outcome.before.values, fitted=False),
+        "after": alike(outcome.after.model, outcome.after.values, fitted=False),
+        "one drag coefficient for all": _held(simulation, first, "quadratic_drag"),
+        "one gravity for all": _held(simulation, first, "gravity_scale"),
+    }
+    terms = [simulation.term(n) for n in outcome.after.model.effects]
+    own = {
+        t.bodies[0] if t.bodies else "all": [outcome.after.values[t.parameters[0].name],
+                                             outcome.after.stderr[t.parameters[0].name]]
+        for t in terms
+    }  # fmt: skip
+    return {
+        "accepted": list(outcome.after.model.effects), "own": own, "held_out_mm": rows, "refused": found.refused,
+        "shared": [
+            {"bodies": s.bodies,
+             "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.effect)},
+             "spread": unlike(s, outcome, simulation), "information_gain": s.gain,
+             "held_out_mm": alike(s.fitted.model, s.fitted.values, fitted=False)}
+            for s in found.shared
+        ],
+        "trials": {
+            n: {"fit_mm": t.fitted.fit_mm, "held_out_mm": t.fitted.held_out_mm, "objections": t.reasons,
+                "information_gain": outcome.before.bic(t.fitted.samples) - t.fitted.bic(t.fitted.samples)}
+            for n, t in first.items()
+        },
+        "gravity": 9.8 * (1 + first["gravity_scale"].fitted.values["gravity_scale.relative_change"])
+        if "gravity_scale" in first else None,
+        "flights": simulation.rollouts, "seconds": seconds,
+    }  # fmt: skip
+
+
+def _held(simulation, trials: dict, name: str) -> dict | None:
+    if name not in trials:
+        return None
+    fitted = trials[name].fitted
+    return simulation.by_body(fitted.model, fitted.values, fitted=False)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", default="balls", choices=["scenes", "balls"])
+    parser.add_argument("--out", type=Path, default=Path("measured_scenes"))
+    parser.add_argument("--json", type=Path)
+    asked = parser.parse_args()
+    source = data_folder()
+    if not source.is_dir():
+        print(f"no measured data in {source}: set MASIV_MEASURED to the folder that holds ball_drops")
+        return
+    if asked.what == "scenes":
+        print(write_balls(source / "ball_drops", asked.out / "balls"))
+        return
+    import torch
+
+    from masiv import runtime
+
+    runtime.start("cpu")
+    torch.set_num_threads(1)
+    text = json.dumps(balls(source / "ball_drops"), indent=1)
+    if asked.json:
+        asked.json.write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""Refine several bodies that share physics: what do they lack together, and what each by itself?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from masiv.errors import InputError, MasivError
+from masiv.progress import Progress, silent
+from masiv.refine.config import RefineConfig
+from masiv.refine.loop import Outcome, close_loop, objections
+from masiv.refine.model import Model
+from masiv.refine.refit import Fitted, full_fit, softness
+from masiv.refine.simulated import Term
+from masiv.tracks.points import RIGID, PointSimulation, point_runs
+from masiv.tracks.tracks import Tracks
+
+
+@dataclass(frozen=True)
+class SharedFit:
+    """An effect that several bodies have, with one strength for them all. gain: how much lower the information
+    criterion is than with one strength each (negative: the data asks for one each)."""
+
+    effect: str
+    bodies: tuple[str, ...]
+    fitted: Fitted
+    gain: float
+
+
+@dataclass(frozen=True)
+class GroupRefined:
+    """before, after: fields of all runs, see ``PointSimulation.fields``. refused: what an effect that was accepted for
+    all, one strength each, came to for a body by itself: body -> reasons against it."""
+
+    outcome: Outcome
+    simulation: PointSimulation
+    before: list[np.ndarray]
+    after: list[np.ndarray]
+    refused: dict[str, list[str]] = field(default_factory=dict)
+    shared: tuple[SharedFit, ...] = ()
+
+
+def refine_group(
+    tracks: Tracks, group: str, config: RefineConfig, *, dry_run: bool = False, progress: Progress = silent
+) -> GroupRefined:
+    """Look for what the flights of ``group`` lack; runs with ``use: hold_out`` judge it.
+
+    An effect of the surroundings is one for all bodies. One that depends on the body is tried for all with one
+    strength, for all with one each, and for each body alone. A strength is shared only where no body's held-out flight
+    gets worse by it; of one strength each, a body keeps its own where its own flights confirm it.
+    Raises InputError where nothing is held out.
+    """
+    simulation = PointSimulation(tracks, point_runs(tracks, group))
+    for body in simulation.bodies:
+        if {run.fitted for run in simulation.experiments if run.body == body} != {True, False}:
+            raise InputError(f"{tracks.path}: body {body} needs a run to fit and one with `use: hold_out` to judge by")
+    base = baseline(simulation)
+    if dry_run:
+        searched = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
+    else:
+        more = len(simulation.bodies)  # flights cost nothing: try all that a body may have of its own
+        searched = config.model_copy(
+            update={"max_effects": config.max_effects + more, "shortlist": config.shortlist + 2 * more}
+        )
+    outcome = close_loop(simulation, [base], searched, progress)
+    outcome, refused = confirmed(simulation, outcome, config)
+    fields = [simulation.fields(f.model, f.values, held_out=True) for f in (outcome.before, outcome.after)]
+    return GroupRefined(outcome, simulation, fields[0], fields[1], refused, shared(simulation, outcome))
+
+
+def baseline(
+    simulation: PointSimulation, model: Model | None = None, values: Mapping[str, float] | None = None
+) -> Fitted:
+    """Free fall, where only the start of each run is fitted; or ``model``, from ``values``."""
+    model = model or Model(RIGID, "none")
+    return full_fit(simulation, model, values or {}, budget=12 * (len(simulation.parameters(model)) + 1))
+
+
+def confirmed(
+    simulation: PointSimulation, outcome: Outcome, config: RefineConfig
+) -> tuple[Outcome, dict[str, list[str]]]:
+    """``outcome`` where of an effect with one strength each only those bodies keep it whose own flights confirm it, by
+    the loop's own rules; and the objections of the others. Standard errors are from each body's own flights."""
+    after, refused = outcome.after, {}
+    for term in [simulation.term(name) for name in after.model.effects]:
+        if len(term.bodies) < 2:
+            continue
+        others = Model(after.model.family, "none", tuple(n for n in after.model.effects if n != term.name))
+        kept, values, stderr = [], dict(after.values), {}
+        for body in term.bodies:
+            own = simulation.made(term.effect, (body,))
+            # Not from nothing: a fit that begins on a bound hardly leaves it.
+            start = {
+                p.name: max(after.values[q.name], p.step)
+                for p, q in zip(own.parameters, simulation.own(term, body), strict=True)
+            }
+            found = _alone(simulation, body, others, {**after.values, **start}, own, config)
+            if isinstance(found, Fitted):
+                kept.append(own.name)
+                values |= found.values
+                stderr |= {p.name: found.stderr[p.name] for p in own.parameters}
+            else:
+                refused[body] = found
+        model = replace(others, effects=(*others.effects, *kept))
+        after = full_fit(
+            simulation,
+            model,
+            values,
+            budget=3 * (len(simulation.parameters(model)) + 1),
+            soft=soft_of(simulation, outcome),
+        )
+        after = replace(after, stderr={**after.stderr, **stderr})
+    if not after.model.effects:
+        after = outcome.before
+    return replace(outcome, after=after), refused
+
+
+def _alone(
+    simulation: PointSimulation, body: str, others: Model, values: Mapping[str, float], own: Term,
+    config: RefineConfig,
+) -> Fitted | list[str]:  # fmt: skip
+    """The fit of ``own`` to the flights of ``body`` alone, or the reasons against it."""
+    one = simulation.alone(body, others, values)
+    try:
+        without = baseline(one, others, values)
+        tried = baseline(one, others.with_effect(own.name), values)
+    except MasivError as failed:
+        return [str(failed)]
+    reasons = [*objections(without, tried, own, one.experiments, config), *one.objections(without, tried, own, config)]
+    return reasons or tried
+
+
+def soft_of(simulation: PointSimulation, outcome: Outcome) -> float:
+    """Size [m] from which a residual of the outcome counts as wild."""
+    return softness(simulation.residual(outcome.before.model, outcome.before.values))
+
+
+def shared(simulation: PointSimulation, outcome: Outcome) -> tuple[SharedFit, ...]:
+    """Effects accepted for two bodies or more, each refitted with one strength for those."""
+    after, out = outcome.after, []
+    terms = [simulation.term(name) for name in after.model.effects]
+    for effect in dict.fromkeys(t.effect for t in terms if t.bodies):
+        parts = [t for t in terms if t.effect == effect]
+        if len(parts) < 2:
+            continue
+        bodies = tuple(b for t in parts for b in t.bodies)
+        one = simulation.made(effect, bodies)
+        kept = tuple(n for n in after.model.effects if simulation.term(n) not in parts)
+        model = replace(after.model, effects=(*kept, one.name))
+        start = {
+            p.name: float(np.mean([after.values[q.parameters[k].name] for q in parts]))
+            for k, p in enumerate(one.parameters)
+        }
+        budget = 6 * (len(after.parameters) + 1)
+        fitted = full_fit(
+            simulation, model, {**after.values, **start}, budget=budget, soft=soft_of(simulation, outcome)
+        )
+        out.append(SharedFit(effect, bodies, fitted, after.bic(after.samples) - fitted.bic(after.samples)))
+    return tuple(out)
+
+
+def unlike(fits: SharedFit, outcome: Outcome, simulation: PointSimulation) -> float:
+    """How far bodies differ in the first strength that ``fits`` gives them in common: standard deviation."""
+    own = [
+        outcome.after.values[t.parameters[0].name]
+        for t in (simulation.term(n) for n in outcome.after.model.effects)
+        if t.effect == fits.effect and t.bodies
+    ]
+    return float(np.std(own, ddof=1)) if len(own) > 1 else math.nan

@@ -1,0 +1,307 @@
+"""Runs of one deformable body with markers, let go from rest: the simulations that refine's loop works on.
+
+They fulfil ``masiv.refine.simulated.Simulated``. What is fitted beside the law and the effects is when each run was let
+go, since a reader knows it to a few milliseconds; that of a held-out run is found from its own motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+
+from masiv.effects.active import ActiveEffects
+from masiv.effects.effect import EffectParameter, Outline, Setting
+from masiv.effects.library import causes, effect_named
+from masiv.errors import InputError, MasivError, NonFiniteError
+from masiv.identify.parametric import Parameter
+from masiv.materials.classical import ClassicalLaw
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.rollout import rollout
+from masiv.refine.config import RefineConfig
+from masiv.refine.model import Model
+from masiv.refine.refit import Fitted, rms_mm
+from masiv.refine.simulated import Term
+from masiv.tracks.body import Plan, SimulatedBody, plan, simulated_body
+from masiv.tracks.points import outline_of
+from masiv.tracks.tracks import Run, Tracks
+
+RELEASE_REACH, RELEASE_STEP = 0.03, 1e-3
+FINEST_OUTPUT = 2.5e-3
+"""Time [s] between two states of a rollout that are kept; motion between them is a cubic spline."""
+STABLE = 1.3
+"""A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
+KEPT = 24
+LOST = 0.7
+"""Share of the swing from which a residual says that the phase is lost."""
+LEAST_SEEN = 0.5
+BESIDE = 0.15
+"""How far from the body, in lengths of it, something that acts on it may be."""
+
+
+@dataclass(frozen=True)
+class BodyRun:
+    """A run from its release on: observed (K, M, 3) [m, world] of the markers tied to the body at ``times`` (K,) [s
+    since the release that the reader found], frames where one is not seen left out. speed [m/s]: their greatest;
+    noise [m], sigma (K,): see ``masiv.refine.simulated.Watched``, the noise while the body is held."""
+
+    name: str
+    condition: str
+    times: np.ndarray
+    observed: np.ndarray
+    body: SimulatedBody
+    fitted: bool
+    speed: float
+    noise: float
+    sigma: np.ndarray
+
+    @property
+    def instants(self) -> int:
+        return len(self.times)
+
+    def weighted(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, M, A) [m], less where the model itself is less certain."""
+        return field * (self.noise / self.sigma[: len(field), None, None])
+
+    @property
+    def rows(self) -> int:
+        return len(self.times) if self.fitted else 0
+
+    @property
+    def holds_out(self) -> bool:
+        return not self.fitted
+
+    @property
+    def places(self) -> np.ndarray:
+        return self.body.markers_to_world(self.body.particles[None])[0]
+
+    @property
+    def release(self) -> Parameter:
+        """How much later [s] it was let go."""
+        return Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP)
+
+
+def body_run(tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, duration: float) -> BodyRun:
+    """``run`` for ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises InputError."""
+    if run.release is None:
+        raise InputError(f"{tracks.path}: run {run.name}: nobody knows when it was let go: give rest_frames")
+    body = simulated_body(tracks, run, config, particle_spacing=spacing)
+    cut = run.between(run.release, run.release + duration)
+    markers = list(body.markers)
+    whole = np.asarray(np.isfinite(cut.positions[:, markers]).all(axis=(1, 2)), bool)
+    if whole.mean() < LEAST_SEEN or whole.sum() < 6:
+        raise InputError(
+            f"{tracks.path}: run {run.name}: all of {', '.join(run.markers[m] for m in markers)} are seen in "
+            f"{int(whole.sum())} of {len(whole)} frames: leave out with markers those that are rarely seen"
+        )
+    observed = cut.positions[whole][:, markers]
+    times = cut.elapsed[whole]
+    speed = float(np.linalg.norm(np.diff(observed, axis=0), axis=2).max() / np.diff(times).min())
+    noise = 1e-6 if run.noise is None else max(float(np.sqrt((run.noise[markers] ** 2).sum(1).mean())), 1e-6)
+    sigma = np.full(len(times), noise)
+    return BodyRun(run.name, run.condition, times, observed, body, run.purpose == "fit", speed, noise, sigma)
+
+
+class BodySimulation:
+    """Runs of one body. known: values of law and effects that are not fitted; contact: with the ground."""
+
+    def __init__(
+        self,
+        tracks: Tracks,
+        runs: Sequence[BodyRun],
+        config: SimulatorConfig,
+        *,
+        known: Mapping[str, float] | None = None,
+        horizons: Sequence[float] = (),
+    ) -> None:
+        """runs: see ``body_run``; horizons [s]:
+        after which a search may stop to look."""
+        self.horizons = tuple(horizons)
+        self.tracks = tracks
+        self.experiments: Sequence[BodyRun] = tuple(runs)
+        self.config = config
+        self.known = dict(known or {})
+        self.outline: Outline = outline_of(tracks, next(iter(tracks.bodies.values())))
+        self.ground = tracks.ground is not None
+        self.rollouts = 0
+        self.substeps: dict[tuple[str, float], float] = {}
+        self.kept: dict[tuple, CubicSpline] = {}
+
+    def over(self, runs: Sequence[BodyRun]) -> BodySimulation:
+        """The same with other runs."""
+        return BodySimulation(self.tracks, runs, self.config, known=self.known)
+
+    # -- models -------------------------------------------------------------------------------------------------
+
+    def parameters(self, model: Model) -> tuple[Parameter, ...]:
+        """Law, release of each fitted run, effects; without what is known."""
+        every = [
+            *model.family.parameters,
+            *(run.release for run in self.experiments if run.fitted),
+            *(p for name in model.effects for p in self.term(name).parameters),
+        ]
+        return tuple(p for p in every if p.name not in self.known)
+
+    def candidates(self, model: Model) -> list[str]:
+        """Effects that ``model`` lacks; a clock that is off is a release at another time, and so is fitted already."""
+        taken = not self.ground or any(effect_named(n).on_grid == "ground" for n in model.effects)
+        out = []
+        for name, effect in causes().items():
+            on_ground = effect.on_grid == "ground" or name == "ground_height"
+            if name not in model.effects and name != "time_offset" and not (on_ground and taken):
+                out.append(name)
+        return out
+
+    def term(self, name: str) -> Term:
+        """The effect, its steps in proportion to the body."""
+        effect = effect_named(name)
+        own = [self._parameter(name, p) for p in effect.shared or effect.parameters]
+        cut = effect.strengths
+        guesses = tuple(tuple(g) for g in effect.guesses(self._setting(self.experiments[0])))
+        units = {f"{name}.{p.name}": p.unit for p in effect.shared or effect.parameters}
+        return Term(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
+
+    def _parameter(self, name: str, p: EffectParameter) -> Parameter:
+        particles = self.experiments[0].body.particles.numpy()
+        low, high = particles.min(0), particles.max(0)
+        size = float((high - low).max())
+        lower, upper, step = p.lower, p.upper, p.step
+        if p.unit == "kg":
+            upper, step = min(upper, 30 * self.outline.mass), 0.05 * self.outline.mass
+        elif p.unit == "m":
+            step = 0.04 * size
+            if p.name in "xyz":  # a place is in the body or at it
+                k = "xyz".index(p.name)
+                lower, upper = float(low[k]) - BESIDE * size, float(high[k]) + BESIDE * size
+        return Parameter(f"{name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
+
+    def _setting(self, run: BodyRun) -> Setting:
+        duration = float(run.times[-1])
+        return run.body.effects((), duration=duration, frame_time=duration / (len(run.times) - 1)).setting
+
+    def _members(self, model: Model, values: Mapping[str, float]) -> tuple:
+        out = []
+        for name in model.effects:
+            effect = effect_named(name)
+            given = torch.tensor([values[p.name] for p in self.term(name).parameters], dtype=torch.float32)
+            out.append((effect, effect.of(given, self.outline) if effect.shared else given))
+        return tuple(out)
+
+    def law(self, model: Model, values: Mapping[str, float]) -> ClassicalLaw:
+        """The law among ``values`` and what is known."""
+        both = {**self.known, **values}
+        names = {p.name for p in model.family.parameters} | (self.known.keys() & LAW_NAMES)
+        return ClassicalLaw(model.family.kind, **{n: both[n] for n in names})
+
+    # -- motion -------------------------------------------------------------------------------------------------
+
+    def planned(self, run: BodyRun, model: Model, values: Mapping[str, float], times: np.ndarray) -> Plan:
+        """How to simulate ``run`` to ``times`` (T,) [s]: by the substep of its first law. NonFiniteError for one
+        that is much stiffer."""
+        law = self.law(model, values)
+        planned = plan(run.body, law, times, self.config, speed=run.speed)
+        needed = planned.simulator.substep
+        held = self.substeps.setdefault((run.name, run.body.spacing), needed)
+        if needed * STABLE < held:
+            raise NonFiniteError(0, 0, f"the law needs substeps of {needed:.2g} s, not {held:.2g} s")
+        return plan(run.body, law, times, self.config, substep=held)
+
+    def acting(self, run: BodyRun, model: Model, values: Mapping[str, float], duration: float) -> ActiveEffects:
+        """The effects of ``model``, and the clamp."""
+        frame_time = float(np.median(np.diff(run.times)))
+        members = self._members(model, {**self.known, **values})
+        return run.body.effects(members, duration=duration, frame_time=frame_time)
+
+    @torch.no_grad()
+    def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
+        """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
+        both = {**self.known, **values}
+        key = (
+            run.name,
+            float(run.times[-1]),
+            model.effects,
+            tuple(sorted((n, v) for n, v in both.items() if "@" not in n)),
+        )
+        if key in self.kept:
+            return self.kept[key]
+        last = float(run.times[-1]) + RELEASE_REACH
+        times = np.linspace(0, last, int(np.ceil(last / FINEST_OUTPUT)) + 1)
+        try:
+            planned = self.planned(run, model, values, times)
+            active = self.acting(run, model, values, last)
+            self.rollouts += 1
+            state = run.body.released(planned.simulator.dtype)
+            law = self.law(model, values)
+            positions = rollout(planned.simulator, law, state, planned.steps, planned.outputs, active)
+        except (InputError, NonFiniteError):
+            raise
+        except MasivError as failed:
+            raise NonFiniteError(0, 0, str(failed)) from failed
+        at = np.array(planned.outputs) * planned.simulator.substep
+        spline = CubicSpline(at, run.body.markers_to_world(positions))
+        if len(self.kept) >= KEPT:
+            self.kept.pop(next(iter(self.kept)))
+        self.kept[key] = spline
+        return spline
+
+    def markers(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
+        """Markers (K, M, 3) [m, world] of the model at the run's times."""
+        path = self.path(run, model, values)
+        known = values.get(run.release.name) if run.fitted else None
+        shift = self._release(run, path) if known is None else known
+        return path(np.clip(run.times - shift, 0.0, None))
+
+    def _release(self, run: BodyRun, path: CubicSpline) -> float:
+        """How much later a held-out run was let go: nearest to its motion."""
+        shift, slope = 0.0, path.derivative()
+        for _ in range(8):
+            at = np.clip(run.times - shift, 0.0, None)
+            along = (slope(at) * (run.times > shift)[:, None, None]).ravel()
+            off = (path(at) - run.observed).ravel()
+            shift = float(np.clip(shift + along @ off / (along @ along), -RELEASE_REACH, RELEASE_REACH))
+        return shift
+
+    def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
+        """Simulated less observed (K, M, 3) [m, world] of each run; of a held-out run nothing but on request."""
+        return [
+            self.markers(run, model, values) - run.observed
+            if run.fitted or held_out
+            else np.zeros((0, *run.observed.shape[1:]))
+            for run in self.experiments
+        ]
+
+    def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
+        """Of the fitted runs, weighted, flat."""
+        found = zip(self.experiments, self.fields(model, values), strict=True)
+        return np.concatenate([run.weighted(f).ravel() for run, f in found])
+
+    def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
+        """None: over many periods two grids are out of phase, which would hide all else. See benchmarks/measured.md."""
+        return None
+
+    def early(self, base: Fitted) -> Sequence[BodySimulation]:
+        """The first moments, then ever more, where the residual is as large as the swing: then the phase is lost."""
+        swing = [run.observed - run.observed.mean(0) for run in self.experiments if run.fitted]
+        if base.fit_mm < LOST * rms_mm(swing):
+            return ()
+        runs = [run for run in self.experiments if run.fitted]
+        return [self.over([shortened(run, horizon) for run in runs]) for horizon in self.horizons]
+
+    def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
+        """What the medium cannot do."""
+        theta = torch.tensor([after.values[p.name] for p in term.parameters], dtype=torch.float64)
+        why = effect_named(term.effect).contradiction(theta, self.outline)
+        return [] if why is None else [why]
+
+
+LAW_NAMES = frozenset({"youngs_modulus", "poissons_ratio", "yield_stress", "friction_angle", "viscosity",
+                       "bulk_modulus", "shear_modulus", "plastic_viscosity"})  # fmt: skip
+
+
+def shortened(run: BodyRun, duration: float) -> BodyRun:
+    """The first ``duration`` [s] of a run."""
+    kept = run.times <= duration
+    return replace(run, times=run.times[kept], observed=run.observed[kept], sigma=run.sigma[kept])

@@ -1,0 +1,155 @@
+"""Bodies in flight that share physics: exact flights, what is shared and what is not, and no free gravity a ball."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from masiv.errors import InputError
+from masiv.refine.config import RefineConfig
+from masiv.refine.model import Model
+from masiv.tracks.group import refine_group
+from masiv.tracks.points import RIGID, PointSimulation, mean_diameter, point_runs
+from masiv.tracks.read import read_tracks
+
+pytestmark = pytest.mark.usefixtures("taichi")
+G, AIR = 9.8, 1.2
+
+
+@dataclass(frozen=True)
+class Ball:
+    mass: float
+    diameter: float
+    drag: float
+
+    @property
+    def rate(self) -> float:
+        """k of a = -k v^2 [1/m]."""
+        return AIR * self.drag * np.pi * self.diameter**2 / (8 * self.mass)
+
+    def fallen(self, t: np.ndarray, speed: float) -> np.ndarray:
+        """Way down [m], begun at ``speed`` [m/s] downwards, below the terminal velocity."""
+        if self.rate == 0:
+            return speed * t + 0.5 * G * t**2
+        end = np.sqrt(G / self.rate)
+        phase = np.arctanh(speed / end)
+        return end**2 / G * (np.log(np.cosh(G * t / end + phase)) - np.log(np.cosh(phase)))
+
+
+def write_scene(folder, balls, noise=0.01, runs=(1, 2)):
+    random = np.random.default_rng(3)
+    rows, declared, files = ["ball,drop,t,height"], {}, []
+    for name, ball in balls.items():
+        declared[name] = {
+            "mass": ball.mass, "group": "balls",
+            "geometry": {"sphere": ball.diameter, "units": "m", "markers_at": {"centre": [0, 0, 0]}},
+        }  # fmt: skip
+        for drop in runs:
+            t = np.arange(0, 2.6, 1 / 15)
+            heights = 40 + drop - ball.fallen(t, 0.3 * drop) + random.normal(0, noise, len(t))
+            rows += [f"{name},{drop},{a:.9f},{b:.12f}" for a, b in zip(t, heights, strict=True)]
+            files.append({"file": "drops.csv", "body": name, "select": {"ball": name, "drop": drop},
+                          "use": "fit" if drop == 1 else "hold_out"})  # fmt: skip
+    (folder / "drops.csv").write_text("\n".join(rows))
+    (folder / "scene.yaml").write_text(yaml.safe_dump({
+        "layout": "tracks", "units": "m", "up_axis": "y", "bodies": declared, "runs": files,
+        "columns": {"time": "t", "markers": {"centre": {"y": "height"}}},
+    }))  # fmt: skip
+    return read_tracks(folder)
+
+
+def found(tracks):
+    return refine_group(tracks, "balls", RefineConfig.model_validate({}))
+
+
+def test_flight_is_that_of_the_closed_form(tmp_path):
+    balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.5)}
+    tracks = write_scene(tmp_path, balls, noise=0.0)
+    simulation = PointSimulation(tracks, point_runs(tracks, "balls"))
+    for run in simulation.experiments:
+        ball = balls[run.body]
+        model = Model(RIGID, "none", ("quadratic_drag",) if ball.drag else ())
+        values = {"quadratic_drag.drag_coefficient": 0.5}
+        members = simulation.members(model, values, run)
+        drop = int(run.name[-1])
+        path = simulation.flown(run, members, np.array([[40.0 + drop, -0.3 * drop]]))[0]
+        exact = 40 + drop - ball.fallen(run.times, 0.3 * drop)
+        assert np.abs(path[:, 0] - exact).max() < (2e-5 if ball.drag else 1e-10)
+        if not run.fitted:  # its start is found from its own flight
+            np.testing.assert_allclose(simulation.start_of(run, model, values), [40 + drop, -0.3 * drop], atol=1e-4)
+
+
+def test_one_coefficient_where_all_share_it(tmp_path):
+    balls = {"heavy": Ball(7.0, 0.2, 0.47), "middle": Ball(0.06, 0.065, 0.47), "light": Ball(0.03, 0.08, 0.47)}
+    refined = found(write_scene(tmp_path, balls))
+    after = refined.outcome.after
+    assert after.model.effects == ("quadratic_drag",)
+    name = "quadratic_drag.drag_coefficient"
+    assert after.values[name] == pytest.approx(0.47, abs=max(4 * after.stderr[name], 0.005))
+    assert after.stderr[name] < 0.05
+    assert after.held_out_mm < 15
+
+
+def test_own_coefficients_and_a_body_that_lacks_nothing(tmp_path):
+    balls = {"heavy": Ball(7.0, 0.2, 0.0), "middle": Ball(0.06, 0.065, 0.4), "light": Ball(0.03, 0.08, 0.7)}
+    refined = found(write_scene(tmp_path, balls))
+    after = refined.outcome.after
+    assert sorted(after.model.effects) == ["quadratic_drag@light", "quadratic_drag@middle"]
+    for body in ("middle", "light"):
+        name = f"quadratic_drag@{body}.drag_coefficient"
+        assert after.values[name] == pytest.approx(balls[body].drag, rel=0.03)
+    # One gravity of its own a ball would fit as well as drag, nearly; one of all does not.
+    gravity = next(t for t in refined.outcome.rounds[0].trials if t.candidate.effect == "gravity_scale")
+    assert any("heavy does not share it" in reason for reason in gravity.reasons)
+    assert not any(c.effect.startswith("gravity_scale@") for c in refined.outcome.rounds[0].candidates)
+    linear = next(t for t in refined.outcome.rounds[0].trials if t.candidate.effect == "linear_drag")
+    assert any("it takes a medium of" in reason for reason in linear.reasons)
+    [common] = refined.shared
+    assert set(common.bodies) == {"middle", "light"}
+    assert common.gain < 0  # the data asks for one each
+
+
+def test_clean_flights_lack_nothing(tmp_path):
+    balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.0)}
+    refined = found(write_scene(tmp_path, balls))
+    assert refined.outcome.after.model.effects == ()
+    assert refined.simulation.experiments[0].noise == pytest.approx(0.01, rel=0.4)
+
+
+def test_what_cannot_be_a_group(tmp_path):
+    tracks = write_scene(tmp_path, {"one": Ball(1, 0.1, 0)}, runs=(1,))
+    with pytest.raises(InputError, match="hold_out"):
+        found(tracks)
+    with pytest.raises(InputError, match="no group 'ball': it has balls"):
+        point_runs(tracks, "ball")
+    assert mean_diameter(tracks.bodies["one"].geometry) == pytest.approx(0.1)
+
+
+def measured_folder() -> Path:
+    folder = Path(os.environ.get("MASIV_MEASURED", Path(__file__).parents[2] / "shared" / "measured")) / "ball_drops"
+    if not folder.is_dir():
+        pytest.skip("no measured data: set MASIV_MEASURED to the folder that holds ball_drops")
+    return folder
+
+
+def test_measured_balls():
+    """Drag for the light balls, each its own; nothing for the heavy ones. See benchmarks/measured.md."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    from measured import ball_scene
+
+    refined = found(ball_scene(measured_folder()))
+    after = refined.outcome.after
+    assert sorted(after.model.effects) == [
+        "quadratic_drag@Tennis Ball", "quadratic_drag@Whiffle Ball 1", "quadratic_drag@Yellow Whiffle Ball"
+    ]  # fmt: skip
+    errors = refined.simulation.by_body(after.model, after.values, fitted=False)
+    assert errors["Tennis Ball"] < 350
+    assert errors["Whiffle Ball 1"] < 300
+    assert errors["Bowling Ball"] == pytest.approx(91, abs=2)
+    assert set(refined.refused) == {"Baseball", "Bowling Ball", "Golf Ball"}
