@@ -20,6 +20,8 @@ CHORD_STEPS = 8
 STOP_GAP = "smooth_force"
 SOFT = 5.0
 """Sizes of the noise from which a weighted residual counts as wild, at the least."""
+SIMPLER = 0.25
+"""Variance, over that of noise and grid, that tells nothing."""
 CERTAIN = 1.5
 """Times the noise that sigma is where the motion is as well simulated as it is observed."""
 TELLS_APART = 6.0
@@ -188,9 +190,8 @@ def _round(
     accepted = None
     for trial in trials:
         trial.reasons = _reasons(simulation, current, trial, config)
-    for k, trial in enumerate(t for t in trials if t.passes):
-        if k > 0:
-            break
+    trial = _simplest([t for t in trials if t.passes], simulation.experiments)
+    if trial is not None:
         final = full_fit(
             simulation, trial.fitted.model, trial.fitted.values,
             budget=2 * len(trial.fitted.parameters) + 6, soft=soft,
@@ -199,6 +200,18 @@ def _round(
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
+
+
+def _simplest(passing: Sequence[Trial], experiments: Sequence[Watched]) -> Trial | None:
+    """Of trials, best first, the one with the fewest parameters that explains what the best one does, but for less than
+    noise and grid could change."""
+
+    def lacks(trial: Trial) -> float:
+        squares = zip(trial.fitted.squares, passing[0].fitted.squares, experiments, strict=True)
+        return max(_phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments))
+
+    enough = [t for t in passing if lacks(t) < SIMPLER]
+    return min(enough, key=lambda t: len(t.fitted.parameters), default=None)
 
 
 def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
@@ -279,7 +292,7 @@ def _held_out(
     won = np.concatenate([gained[k][experiments[k].rows :] for k in rest])
     old = np.concatenate([(before.squares[k] / experiments[k].sigma ** 2)[experiments[k].rows :] for k in rest])
     removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
-    if won.mean() >= 1 and removed >= config.least_gain:
+    if won.mean() >= SIMPLER and removed >= config.least_gain:
         return []
     if abs(won.mean()) < 1 and _phases(gained, experiments)[0] >= config.decisive:
         return []  # they cannot tell, where the body flies or is otherwise well simulated it is plain
