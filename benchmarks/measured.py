@@ -105,6 +105,8 @@ def ball_scene(source: Path):
 def balls(source: Path) -> dict:
     """What refine finds in the ball drops, and what one free gravity a ball would have looked like."""
     from masiv.refine.config import RefineConfig
+    from masiv.refine.model import Model
+    from masiv.refine.refit import full_fit
     from masiv.tracks.group import refine_group, unlike
 
     tracks = ball_scene(source)
@@ -120,6 +122,11 @@ def balls(source: Path) -> dict:
         "one drag coefficient for all": _held(simulation, first, "quadratic_drag"),
         "one gravity for all": _held(simulation, first, "gravity_scale"),
     }
+    each = simulation.made("gravity_scale", simulation.bodies, each=True)
+    start = {p.name: -0.1 for p in each.parameters} | outcome.before.values
+    model = Model(outcome.before.model.family, "none", (each.name,))
+    trap = full_fit(simulation, model, start, budget=20 * (len(start) + 1))
+    rows["one gravity each, which cannot be"] = alike(model, trap.values, fitted=False)
     terms = [simulation.term(n) for n in outcome.after.model.effects]
     own = {
         t.bodies[0] if t.bodies else "all": [outcome.after.values[t.parameters[0].name],
@@ -135,6 +142,8 @@ def balls(source: Path) -> dict:
              "held_out_mm": alike(s.fitted.model, s.fitted.values, fitted=False)}
             for s in found.shared
         ],
+        "gravity_each": [9.8 * (1 + trap.values[p.name]) for p in each.parameters],
+        "information_gain_of_gravity_each": outcome.before.bic(trap.samples) - trap.bic(trap.samples),
         "trials": {
             n: {"fit_mm": t.fitted.fit_mm, "held_out_mm": t.fitted.held_out_mm, "objections": t.reasons,
                 "information_gain": outcome.before.bic(t.fitted.samples) - t.fitted.bic(t.fitted.samples)}
@@ -165,6 +174,7 @@ def main() -> None:
         return
     if asked.what == "scenes":
         print(write_balls(source / "ball_drops", asked.out / "balls"))
+        print(write_beam(source / "silicone_beam", asked.out / "beam"))
         return
     import torch
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,7 +94,7 @@ def identify(run: RunFolder, config: Config, tracks: Tracks) -> tuple[dict[str, 
             twin = TracksTwin.load(run.path)
         else:
             with run.stage("identify"):
-                twin, fits = identify_tracks(tracks, config, progress=progress)
+                twin, fits = identify_tracks(tracks, config, folder=_kept(run), progress=progress)
                 families = [
                     {"law": f.model.family.kind, "fit_rmse_mm": f.fit_mm, "held_out_rmse_mm": f.held_out_mm}
                     for f in fits
@@ -113,6 +114,11 @@ def identify(run: RunFolder, config: Config, tracks: Tracks) -> tuple[dict[str, 
 
 def _error(error: float | None) -> str:
     return " (given)" if error is None else f" ± {error:.2g}"
+
+
+def _kept(run: RunFolder) -> Path:
+    """Rollouts of a stage that is not finished."""
+    return run.path / "checkpoints" / "rollouts"
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
@@ -187,7 +193,9 @@ def refine(
     if group and twin.group is None:
         raise InputError(f"{run.path} is of one body: --group is for bodies that fly free and share physics")
     with progress_bar() as progress:
-        found = refine_tracks(tracks, twin, config, condition=condition, dry_run=dry_run, progress=progress)
+        found = refine_tracks(
+            tracks, twin, config, condition=condition, dry_run=dry_run, folder=_kept(run), progress=progress
+        )
         written = document(found, config.refine, dry_run=dry_run)
         other = condition is not None and condition != conditions(tracks)[0]
         stem = f"refine.{condition}" if other else "refine"
@@ -199,6 +207,7 @@ def refine(
             twin = twin_after(twin, found)
             twin.save(run.path)
         report(run, config, tracks, twin, progress)
+    shutil.rmtree(_kept(run), ignore_errors=True)
     lines = [text(named(written))]
     for body, row in written["bodies"].items():
         held = row["held_out_mm"]

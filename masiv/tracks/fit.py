@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -47,6 +48,7 @@ def runs_of(tracks: Tracks, condition: str) -> tuple[Run, ...]:
 
 def simulation_of(
     tracks: Tracks, condition: str, config: TracksConfig, simulator: SimulatorConfig, *, known: dict[str, float],
+    folder: Path | None = None,
 ) -> BodySimulation:  # fmt: skip
     """The runs of ``condition`` over the configured time."""
     body = only_body(tracks)
@@ -60,7 +62,7 @@ def simulation_of(
     runs = made(config.particles)
     last = max(float(run.times[-1]) for run in runs)
     horizons = [h for k in range(16) if (h := config.search_duration * 2**k) < 0.9 * last]
-    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons)
+    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder)
 
 
 def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -63,11 +64,13 @@ def group_of(tracks: Tracks) -> str | None:
     return None
 
 
-def identify_tracks(tracks: Tracks, config: Config, *, progress: Progress = silent) -> tuple[TracksTwin, list[Fitted]]:
+def identify_tracks(
+    tracks: Tracks, config: Config, *, folder: Path | None = None, progress: Progress = silent
+) -> tuple[TracksTwin, list[Fitted]]:
     """The law that explains the runs of the first condition best, and the fits that competed, best first.
 
     Bodies that fly free are rigid: there is nothing to fit but their starts. Raises InputError for a law that has no
-    few parameters, MasivError where none explains the motion.
+    few parameters, MasivError where none explains the motion. folder: keeps rollouts, so that a killed run goes on.
     """
     group = group_of(tracks)
     with runtime.torch_threads(1):
@@ -84,7 +87,7 @@ def identify_tracks(tracks: Tracks, config: Config, *, progress: Progress = sile
         failed = ""
         for kind in kinds:
             mine = known if "poissons_ratio" in {p.name for p in FAMILIES[kind].parameters} else {}
-            simulation = simulation_of(tracks, condition, config.tracks, config.simulator, known=mine)
+            simulation = simulation_of(tracks, condition, config.tracks, config.simulator, known=mine, folder=folder)
             family = family_of(kind, body.density or 1e3, mine)
             try:
                 fits.append(fit_law(simulation, family, config.tracks, progress))
@@ -143,6 +146,7 @@ def simulated(tracks: Tracks, twin: TracksTwin, config: Config, condition: str |
 
 def refine_tracks(
     tracks: Tracks, twin: TracksTwin, config: Config, *, condition: str | None = None, dry_run: bool = False,
+    folder: Path | None = None,
     progress: Progress = silent,
 ) -> Refined | GroupRefined:  # fmt: skip
     """What do the runs of ``condition`` lack? In the first condition the law is fitted with the effects; in others it
@@ -165,13 +169,14 @@ def refine_tracks(
             acting = [e for e in twin.of(condition) if e.condition is None]
             effects = tuple(e.effect for e in acting)
             known = {**law, **{f"{e.effect}.{n}": v for e in acting for n, (v, _, _) in e.parameters.items()}}
-        simulation = simulation_of(tracks, condition, config.tracks, config.simulator, known=known)
+        simulation = simulation_of(tracks, condition, config.tracks, config.simulator, known=known, folder=folder)
         family = family_of(twin.law, only_body(tracks).density or 1e3, known)
         model = Model(family, "sticky" if simulation.ground else "none", effects)
         progress("refine: without effects", 0, 1)
         base = full_fit(simulation, model, values, budget=config.tracks.rollouts)
         progress("refine: without effects", 1, 1, f"{base.fit_mm:.2f} mm")
-        searched = config.refine
+        # No stop-gap for what is left: a smooth force would need as many rollouts as all causes together.
+        searched = config.refine.model_copy(update={"unexplained": np.inf})
         if dry_run:
             searched = searched.model_copy(update={"shortlist": 0, "above_noise": 0.0})
         outcome = close_loop(simulation, [base], searched, progress)

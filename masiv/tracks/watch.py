@@ -6,8 +6,11 @@ go, since a reader knows it to a few milliseconds; that of a held-out run is fou
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -35,8 +38,8 @@ FINEST_OUTPUT = 2.5e-3
 STABLE = 1.3
 """A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
 KEPT = 24
-LOST = 0.7
-"""Share of the swing from which a residual says that the phase is lost."""
+LOST = 1.2
+"""Residual over the swing about its mean from which the phase is lost: of two swings in step it would be less than 1."""
 LEAST_SEEN = 0.5
 BESIDE = 0.15
 """How far from the body, in lengths of it, something that acts on it may be."""
@@ -116,10 +119,12 @@ class BodySimulation:
         *,
         known: Mapping[str, float] | None = None,
         horizons: Sequence[float] = (),
+        folder: Path | None = None,
     ) -> None:
         """runs: see ``body_run``; horizons [s]:
-        after which a search may stop to look."""
+        after which a search may stop to look; folder: where rollouts are kept, which are many and long."""
         self.horizons = tuple(horizons)
+        self.folder = folder
         self.tracks = tracks
         self.experiments: Sequence[BodyRun] = tuple(runs)
         self.config = config
@@ -132,7 +137,7 @@ class BodySimulation:
 
     def over(self, runs: Sequence[BodyRun]) -> BodySimulation:
         """The same with other runs."""
-        return BodySimulation(self.tracks, runs, self.config, known=self.known)
+        return BodySimulation(self.tracks, runs, self.config, known=self.known, folder=self.folder)
 
     # -- models -------------------------------------------------------------------------------------------------
 
@@ -227,6 +232,12 @@ class BodySimulation:
         )
         if key in self.kept:
             return self.kept[key]
+        file = self._file(run, model, key)
+        if file is not None and file.is_file():
+            with np.load(file) as saved:
+                self.substeps.setdefault((run.name, run.body.spacing), float(saved["substep"]))
+                self.kept[key] = CubicSpline(saved["times"], saved["markers"])
+            return self.kept[key]
         last = float(run.times[-1]) + RELEASE_REACH
         times = np.linspace(0, last, int(np.ceil(last / FINEST_OUTPUT)) + 1)
         try:
@@ -241,11 +252,31 @@ class BodySimulation:
         except MasivError as failed:
             raise NonFiniteError(0, 0, str(failed)) from failed
         at = np.array(planned.outputs) * planned.simulator.substep
-        spline = CubicSpline(at, run.body.markers_to_world(positions))
+        markers = run.body.markers_to_world(positions)
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(file.with_suffix(".tmp.npz"), times=at, markers=markers, substep=planned.simulator.substep)
+            os.replace(file.with_suffix(".tmp.npz"), file)
+        spline = CubicSpline(at, markers)
         if len(self.kept) >= KEPT:
             self.kept.pop(next(iter(self.kept)))
         self.kept[key] = spline
         return spline
+
+    def _file(self, run: BodyRun, model: Model, key: tuple) -> Path | None:
+        """Where a rollout is kept on disk, so that a search that was killed goes on."""
+        if self.folder is None:
+            return None
+        held = self.substeps.get((run.name, run.body.spacing))
+        told = (
+            key,
+            model.family.kind,
+            len(run.body.particles),
+            run.body.spacing,
+            self.config.model_dump(),
+            held is None,
+        )
+        return self.folder / f"{hashlib.sha256(repr(told).encode()).hexdigest()[:24]}.npz"
 
     def markers(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Markers (K, M, 3) [m, world] of the model at the run's times."""
