@@ -125,7 +125,7 @@ def test_noise_of_a_rigid_flight_is_found_whatever_the_flight():
         path.append(body @ turn.T + [0.1 * k**1.5, -0.02 * k**2, 0.3 * np.sin(k)])
     noisy = np.array(path)
     noisy[1:] += random.normal(0, 2e-3, noisy[1:].shape)
-    assert noise_floor(noisy, 7) == pytest.approx(2e-3 * np.sqrt(3), rel=0.05)
+    assert noise_floor(noisy, 7) == pytest.approx(2e-3 * np.sqrt(6), rel=0.05)
 
 
 def test_held_out_frames_are_the_runs_own_or_the_last_quarter():

@@ -10,7 +10,7 @@ import numpy as np
 
 from masiv.errors import MasivError
 from masiv.refine.config import RefineConfig
-from masiv.refine.noise import uncertainty
+from masiv.refine.noise import uncertainties
 from masiv.refine.refit import Fitted, chord_fit, column, full_fit, reweighted, softness, summarised
 from masiv.refine.score import Candidate, alike, score
 from masiv.refine.simulated import Simulated, Term, Watched
@@ -116,10 +116,8 @@ def stop_gap(simulation: Simulated, current: Fitted, soft: float, config: Refine
 
 def weigh(simulation: Simulated, fitted: Fitted) -> None:
     """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves."""
-    model, values = fitted.model, fitted.values
-    simulation.experiments = tuple(
-        replace(e, sigma=uncertainty(simulation, model, values, k)) for k, e in enumerate(simulation.experiments)
-    )
+    sigma = uncertainties(simulation, fitted)
+    simulation.experiments = tuple(replace(e, sigma=s) for e, s in zip(simulation.experiments, sigma, strict=True))
 
 
 def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:

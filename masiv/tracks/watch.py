@@ -39,7 +39,7 @@ STABLE = 1.3
 """A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
 KEPT = 24
 LOST = 1.2
-"""Residual over the swing about its mean from which the phase is lost: of two swings in step it would be less than 1."""
+"""Residual over the swing about its mean from which the phase is lost: of two swings in step it is less than 1."""
 LEAST_SEEN = 0.5
 BESIDE = 0.15
 """How far from the body, in lengths of it, something that acts on it may be."""
