@@ -22,6 +22,10 @@ class RefineConfig(BaseModel):
     above_noise: float = Field(
         1.2, ge=0, description="residual over what noise and grid explain, below which nothing is looked for"
     )
+    tracking_error: float = Field(
+        0.4, ge=0, le=1,
+        description="how far points that are followed in pictures are off, over how far they left a rigid motion",
+    )  # fmt: skip
     unexplained: float = Field(
         3.0, ge=1, description="residual over the same floor from which it is called unexplained, not nothing"
     )

@@ -182,8 +182,10 @@ def _round(
                 say(label, done, len(worth), f"{candidate.effect}: {failed}")
         if worth:
             say(f"refine: fit effects, {base.model.family.kind}", len(worth), len(worth), "")
-    rank = {id(f): k for k, f in enumerate(ordered([t.fitted for t in trials]))}
-    trials.sort(key=lambda t: rank[id(t.fitted)])
+    _rank(trials)
+    if trials:
+        _second_chance(simulation, trials, soft, say)
+        _rank(trials)
     confusable = _confusable(ranking, trials, config.confusable)
     accepted = None
     for trial in trials:
@@ -198,6 +200,31 @@ def _round(
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
+
+
+def _rank(trials: list[Trial]) -> None:
+    rank = {id(f): k for k, f in enumerate(ordered([t.fitted for t in trials]))}
+    trials.sort(key=lambda t: rank[id(t.fitted)])
+
+
+def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, say: Say) -> None:
+    """Fit what is simpler than the best trial, with the same law, again from where the best one ended: a flexible cause
+    that found the right law and launch must not win for that alone."""
+    best = trials[0].fitted
+    simpler = [
+        t for t in trials[1:]
+        if t.fitted.model.family.kind == best.model.family.kind and len(t.fitted.parameters) < len(best.parameters)
+    ]  # fmt: skip
+    for done, trial in enumerate(simpler):
+        say("refine: fit simpler effects again", done, len(simpler), trial.candidate.effect)
+        shared = {p.name for p in trial.fitted.parameters} & {p.name for p in best.parameters}
+        values = {**trial.fitted.values, **{name: best.values[name] for name in shared}}
+        budget = 2 * (len(trial.fitted.parameters) + 2)
+        try:
+            again = full_fit(simulation, trial.fitted.model, values, budget=budget, soft=soft)
+        except MasivError:
+            continue
+        trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
 
 
 def _simplest(passing: Sequence[Trial], experiments: Sequence[Watched]) -> Trial | None:
