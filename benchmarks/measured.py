@@ -2,6 +2,7 @@
 
     python benchmarks/measured.py scenes --out DIR        # scenes that masiv reads, one folder each
     python benchmarks/measured.py balls [--json FILE]
+    python benchmarks/measured.py damping --particles 400 1000 1728 --youngs 310e3 --viscosity 250
 
 The measurements are in the folder that MASIV_MEASURED names, ../shared/measured beside the repository by default. They
 are public: see benchmarks/measured.md.
@@ -155,6 +156,46 @@ def balls(source: Path) -> dict:
     }  # fmt: skip
 
 
+def damping(
+    source: Path, particles: list[int], youngs: float, viscosity: float, duration: float, courant: float
+) -> list[dict]:
+    """Frequency and decay of the beam's swing with and without viscosity, by the number of particles: what of the decay
+    is the simulator's own; and those that were measured."""
+    import numpy as np
+    import torch
+    from dissipation import swing
+
+    from masiv.effects.library import effect_named
+    from masiv.materials.classical import ClassicalLaw
+    from masiv.mpm.config import SimulatorConfig
+    from masiv.tracks.body import simulated_body, simulated_markers
+    from masiv.tracks.read import read_tracks
+
+    with tempfile.TemporaryDirectory() as folder:
+        tracks = read_tracks(write_beam(source, Path(folder)))
+    law = ClassicalLaw("neo_hookean", youngs_modulus=youngs, poissons_ratio=0.45)
+    config = SimulatorConfig.model_validate({"courant_number": courant, "max_substeps_per_frame": 4000})
+    times, rows = np.arange(0, duration, 2.5e-3), []
+    for name in ("gravity_a", "gravity_b"):
+        run = next(r for r in tracks.runs if r.name == name)
+        seen = run.between(run.release + 0.03, run.release + duration)
+        hz, rate, amplitude = swing(seen.elapsed, seen.positions[:, 0, 0], 7.5)
+        rows.append({"measured": name, "hz": hz, "decay_per_s": rate, "amplitude_mm": 1e3 * amplitude})
+    for count in particles:
+        body = simulated_body(tracks, tracks.runs[0], config, particle_spacing=(9e-5 / count) ** (1 / 3))
+        for eta in (0.0, viscosity):  # a fine grid and much viscosity need a smaller Courant number
+            began = time.perf_counter()
+            members = ((effect_named("viscosity"), torch.tensor([eta])),)
+            tip = simulated_markers(body, law, times, config, members, speed=0.3)[:, 0, 0]
+            hz, rate, amplitude = swing(times[12:], tip[12:], 7.5)
+            rows.append({
+                "particles": len(body.particles), "grid_mm": 1e3 * body.spacing, "viscosity": eta, "hz": hz,
+                "decay_per_s": rate, "amplitude_mm": 1e3 * amplitude, "seconds": time.perf_counter() - began,
+            })  # fmt: skip
+            print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
 def _held(simulation, trials: dict, name: str) -> dict | None:
     if name not in trials:
         return None
@@ -164,9 +205,14 @@ def _held(simulation, trials: dict, name: str) -> dict | None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="?", default="balls", choices=["scenes", "balls"])
+    parser.add_argument("what", nargs="?", default="balls", choices=["scenes", "balls", "damping"])
     parser.add_argument("--out", type=Path, default=Path("measured_scenes"))
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--particles", type=int, nargs="+", default=[400, 1000])
+    parser.add_argument("--youngs", type=float, default=310e3, help="[Pa]")
+    parser.add_argument("--viscosity", type=float, default=250.0, help="[Pa s]")
+    parser.add_argument("--duration", type=float, default=0.6, help="[s]")
+    parser.add_argument("--courant", type=float, default=0.6)
     asked = parser.parse_args()
     source = data_folder()
     if not source.is_dir():
@@ -182,7 +228,13 @@ def main() -> None:
 
     runtime.start("cpu")
     torch.set_num_threads(1)
-    text = json.dumps(balls(source / "ball_drops"), indent=1)
+    if asked.what == "damping":
+        found = damping(
+            source / "silicone_beam", asked.particles, asked.youngs, asked.viscosity, asked.duration, asked.courant
+        )
+    else:
+        found = balls(source / "ball_drops")
+    text = json.dumps(found, indent=1)
     if asked.json:
         asked.json.write_text(text)
     print(text)

@@ -1,7 +1,8 @@
 """Runs of one deformable body with markers, let go from rest: the simulations that refine's loop works on.
 
 They fulfil ``masiv.refine.simulated.Simulated``. What is fitted beside the law and the effects is when each run was let
-go, since a reader knows it to a few milliseconds; that of a held-out run is found from its own motion.
+go, since a reader knows it to a few milliseconds, and how far aside (horizontally) it was held; those of a held-out run
+are found from its own motion.
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ from masiv.tracks.points import outline_of
 from masiv.tracks.tracks import Run, Tracks
 
 RELEASE_REACH, RELEASE_STEP = 0.03, 1e-3
+ASIDE_REACH, ASIDE_STEP = 3e-3, 1e-4
 FINEST_OUTPUT = 2.5e-3
 """Time [s] between two states of a rollout that are kept; motion between them is a cubic spline."""
 STABLE = 1.3
 """A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
 KEPT = 24
 LOST = 1.2
-"""Residual over the swing about its mean from which the phase is lost: of two swings in step it is less than 1."""
+"""Residual over the swing about its mean from which the phase is lost; of two swings in step it is less than 1."""
 LEAST_SEEN = 0.5
 BESIDE = 0.15
 """How far from the body, in lengths of it, something that acts on it may be."""
@@ -82,9 +84,10 @@ class BodyRun:
         return self.body.markers_to_world(self.body.particles[None])[0]
 
     @property
-    def release(self) -> Parameter:
-        """How much later [s] it was let go."""
-        return Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP)
+    def starts(self) -> tuple[Parameter, ...]:
+        """How much later [s] it was let go, and how far [m] from its rest it was held along two horizontal axes."""
+        aside = (Parameter(f"aside_{k}@{self.name}", 0.0, -ASIDE_REACH, ASIDE_REACH, ASIDE_STEP) for k in (1, 2))
+        return (Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP), *aside)
 
 
 def body_run(tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, duration: float) -> BodyRun:
@@ -131,6 +134,8 @@ class BodySimulation:
         self.known = dict(known or {})
         self.outline: Outline = outline_of(tracks, next(iter(tracks.bodies.values())))
         self.ground = tracks.ground is not None
+        self.across = np.linalg.svd(tracks.up[None])[2][1:]
+        """Two horizontal axes (2, 3), world."""
         self.rollouts = 0
         self.substeps: dict[tuple[str, float], float] = {}
         self.kept: dict[tuple, CubicSpline] = {}
@@ -145,7 +150,7 @@ class BodySimulation:
         """Law, release of each fitted run, effects; without what is known."""
         every = [
             *model.family.parameters,
-            *(run.release for run in self.experiments if run.fitted),
+            *(p for run in self.experiments if run.fitted for p in run.starts),
             *(p for name in model.effects for p in self.term(name).parameters),
         ]
         return tuple(p for p in every if p.name not in self.known)
@@ -281,19 +286,25 @@ class BodySimulation:
     def markers(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Markers (K, M, 3) [m, world] of the model at the run's times."""
         path = self.path(run, model, values)
-        known = values.get(run.release.name) if run.fitted else None
-        shift = self._release(run, path) if known is None else known
-        return path(np.clip(run.times - shift, 0.0, None))
+        names = [p.name for p in run.starts]
+        if run.fitted and all(name in values for name in names):
+            start = np.array([values[name] for name in names])
+        else:
+            start = self._start(run, path)
+        return path(np.clip(run.times - start[0], 0.0, None)) + start[1:] @ self.across
 
-    def _release(self, run: BodyRun, path: CubicSpline) -> float:
-        """How much later a held-out run was let go: nearest to its motion."""
-        shift, slope = 0.0, path.derivative()
+    def _start(self, run: BodyRun, path: CubicSpline) -> np.ndarray:
+        """The values (3,) of ``run.starts`` that bring a held-out run nearest to its own motion (Gauss-Newton)."""
+        start, slope = np.zeros(3), path.derivative()
+        limits = np.array([p.upper for p in run.starts])
         for _ in range(8):
-            at = np.clip(run.times - shift, 0.0, None)
-            along = (slope(at) * (run.times > shift)[:, None, None]).ravel()
-            off = (path(at) - run.observed).ravel()
-            shift = float(np.clip(shift + along @ off / (along @ along), -RELEASE_REACH, RELEASE_REACH))
-        return shift
+            at = np.clip(run.times - start[0], 0.0, None)
+            later = -slope(at) * (run.times > start[0])[:, None, None]
+            columns = [later, *(np.broadcast_to(axis, later.shape) for axis in self.across)]
+            off = path(at) + start[1:] @ self.across - run.observed
+            step = np.linalg.lstsq(np.stack([c.ravel() for c in columns], axis=1), -off.ravel(), rcond=None)[0]
+            start = np.clip(start + step, -limits, limits)
+        return start
 
     def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
         """Simulated less observed (K, M, 3) [m, world] of each run; of a held-out run nothing but on request."""
