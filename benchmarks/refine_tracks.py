@@ -69,7 +69,7 @@ def cases():
     out.append(Case("linear_drag+viscosity", law, parameters, two, seed=len(out)))
     for name, values in OUTSIDE.items():
         out.append(Case(f"unknown_{name}", law, parameters, {}, seed=len(out), outside={name: values}))
-    return out
+    return sorted(out, key=lambda case: case.law != "neo_hookean" or case.name.endswith("_stiff"))
 
 
 def refined(case, particles, laws):

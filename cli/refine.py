@@ -23,6 +23,10 @@ def refine(
         str | None, typer.Option("--condition", help="Tracks: what do the runs of this condition lack besides?")
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rank the effects, fit none; changes no twin.")] = False,
+    relearn: Annotated[
+        bool,
+        typer.Option("--relearn", help="Learn the neural law anew beside the effects. [default: the classical law]"),
+    ] = False,
     config: ConfigOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
@@ -75,6 +79,9 @@ def refine(
             checkpoint=folder.checkpoint("refine"),
             progress=progress,
         )
-        document = save(folder, scene, throws[0], found, twin, settings.refine, dry_run, progress)
+        document = save(
+            folder, scene, throws[0], found, twin, settings.refine, dry_run, progress,
+            relearn_with=settings if relearn else None,
+        )  # fmt: skip
     folder.checkpoint("refine").clear()
     return {"refine": str(run / "refine.json"), **document}, text(document)

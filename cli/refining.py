@@ -54,14 +54,20 @@ def save(
     config: RefineConfig,
     dry_run: bool,
     progress: Progress,
+    relearn_with: Config | None = None,
 ) -> dict[str, Any]:
-    """Write refine.json, refine.npz and the report, and where an effect was accepted the new twin and what it gives."""
+    """Write refine.json, refine.npz and the report, and where an effect was accepted the new twin and what it gives.
+
+    relearn_with: settings with which its law is learnt anew beside the effects; the classical one stays where None."""
     from masiv.mpm.simulate import simulate
     from masiv.refine.stage import twin_of
     from masiv.refine.summary import summary
 
     document = summary(found, config, dry_run=dry_run)
-    new = twin_of(found.outcome.after, throw, found.simulation, twin)
+    changed = bool(document["accepted"] or document["stop_gap"]) and not dry_run
+    new = twin_of(found.outcome.gap or found.outcome.after, throw, found.simulation, twin)
+    if relearn_with is not None and changed:
+        new = _relearnt(run, relearn_with, new, scene, progress)
     old = twin_of(found.outcome.before, throw, found.simulation, twin)
     dynamic = stages.load_dynamic(run)
     rollouts = {
@@ -72,7 +78,7 @@ def save(
         for split, numbers in _pictures(scene, dynamic, positions, throw, progress).items():
             document[name][split] |= numbers
     _save_fields(run.path / "refine.npz", found)
-    if document["accepted"] and not dry_run:
+    if changed:
         _keep_old(run.path)
         _forget(run)
         new.save(run.path)
@@ -84,6 +90,19 @@ def save(
     write_json(run.path / "refine.json", document)
     _report(run, scene, dynamic, progress)
     return document
+
+
+def _relearnt(run: RunFolder, config: Config, twin: Twin, scene: Scene, progress: Progress) -> Twin:
+    from masiv.identify.stage import relearn
+
+    seen = stages.fitted_scene(run, scene)
+    trajectory = stages.load_trajectory(run)
+    checkpoint = run.checkpoint("relearn")
+    learnt = relearn(
+        twin, seen, trajectory, config.identify, seed=config.seed, checkpoint=checkpoint, progress=progress
+    )
+    checkpoint.clear()
+    return learnt
 
 
 def _forget(run: RunFolder) -> None:

@@ -12,6 +12,7 @@ import torch
 from masiv.effects.active import ActiveEffects
 from masiv.effects.effect import Setting
 from masiv.effects.library import effect_named
+from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.parametric import Parameter
 from masiv.materials.classical import ClassicalLaw
@@ -44,7 +45,7 @@ def scene():
                  mask_source="none")  # fmt: skip
 
 
-def observed(effects, noise_m=3e-4):
+def observed(effects, noise_m=3e-4, velocity=VELOCITY, omega=OMEGA):
     """The motion of a cube that is thrown and lands, with ``effects`` {name: parameters} at work."""
     side = round(COUNT ** (1 / 3))
     axis = (torch.arange(side) + 0.5) / side * SIDE
@@ -57,28 +58,31 @@ def observed(effects, noise_m=3e-4):
     law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
     outputs = [k * steps for k in range(1, FRAMES)]
     with torch.no_grad():
-        path = rollout(simulator, law, thrown(start, torch.tensor(VELOCITY), torch.tensor(OMEGA)), outputs[-1],
+        path = rollout(simulator, law, thrown(start, torch.tensor(velocity), torch.tensor(omega)), outputs[-1],
                        outputs, ActiveEffects(members, setting) if members else None)  # fmt: skip
     positions = np.concatenate([start[None].numpy(), path.numpy()]).astype(np.float64)
     positions[1:] += np.random.default_rng(0).normal(0, noise_m, positions[1:].shape)
     return SampledMotion(positions, np.arange(FRAMES) / FPS, SIDE**3)
 
 
-def found(effects):
+def found(*motions, **settings):
     config = RefineConfig.model_validate(
         {"particles": COUNT, "laws": ["neo_hookean"], "shortlist": 3, "samples_per_frame": 1, "max_effects": 2}
+        | settings
     )
-    motion = observed(effects)
-    throw = Throw("run", scene(), SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume),
-                  motion, FITTED)  # fmt: skip
+    throws = [
+        Throw(f"run{k}" if k else "run", scene(),
+              SampledMotion(m.positions[:FITTED], m.times[:FITTED], m.volume), m, FITTED)
+        for k, m in enumerate(motions)
+    ]  # fmt: skip
     refined = refine(
-        [throw], IdentifyConfig.model_validate({"contact": "sticky"}), SimulatorConfig.model_validate({}), config
+        throws, IdentifyConfig.model_validate({"contact": "sticky"}), SimulatorConfig.model_validate({}), config
     )
     return refined, summary(refined, config, dry_run=False)
 
 
 def test_undeclared_drag_is_named_measured_and_confirmed():
-    refined, document = found({"linear_drag": [1.0]})
+    refined, document = found(observed({"linear_drag": [1.0]}))
     assert document["verdict"] == "effect added"
     assert [a["effect"] for a in document["accepted"]] == ["linear_drag"]
     assert document["accepted"][0]["theta"]["rate"] == pytest.approx(1.0, rel=0.1)
@@ -89,8 +93,23 @@ def test_undeclared_drag_is_named_measured_and_confirmed():
     assert refined.outcome.after.values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
 
 
+def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
+    other = observed({"body_force": [0.0, 0.0, 2.0]}, velocity=(-0.5, 1.0, 1.0), omega=(0.0, -2.0, 1.0))
+    refined, document = found(
+        observed({"body_force": [0.0, 0.0, 2.0]}), other, effects=["body_force", "linear_drag"], max_effects=1
+    )
+    assert [a["effect"] for a in document["accepted"]] == ["body_force"]
+    assert list(document["accepted"][0]["theta"].values()) == pytest.approx([0, 0, 2], abs=0.1)
+    values = refined.outcome.after.values
+    assert values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
+    assert values["velocity_x@run1"] == pytest.approx(-0.5, abs=0.05)
+    assert len(refined.after) == 2
+    with pytest.raises(InputError, match="unknown effect 'ether'"):
+        found(other, effects=["ether"])
+
+
 def test_nothing_is_missing_where_nothing_is():
-    _, document = found({})
+    _, document = found(observed({}))
     assert document["verdict"] == "nothing missing"
     assert document["accepted"] == []
     assert document["before"] == document["after"]
@@ -106,7 +125,7 @@ def test_noise_of_a_rigid_flight_is_found_whatever_the_flight():
         path.append(body @ turn.T + [0.1 * k**1.5, -0.02 * k**2, 0.3 * np.sin(k)])
     noisy = np.array(path)
     noisy[1:] += random.normal(0, 2e-3, noisy[1:].shape)
-    assert noise_floor(noisy, 7) == pytest.approx(2e-3 * np.sqrt(3), rel=0.05)
+    assert noise_floor(noisy, 7) == pytest.approx(2e-3 * np.sqrt(6), rel=0.05)
 
 
 def test_held_out_frames_are_the_runs_own_or_the_last_quarter():

@@ -86,6 +86,22 @@ def test_nothing_found(tmp_path):
     assert [text for text in ("What was added", "held out", "Refits") if text in section] == []
 
 
+def test_a_stop_gap_is_called_one(tmp_path):
+    gap = {
+        "effect": "smooth_force",
+        "theta": {},
+        "stderr": {},
+        "unit": {},
+        "fit_rmse_mm": 3.25,
+        "held_out_rmse_mm": 9.75,
+    }
+    write(tmp_path, document(accepted=[], verdict="unexplained residual", stop_gap=gap), fields())
+    section = refine_section(tmp_path)
+    assert [
+        t for t in ("unexplained residual", "not an explanation", "3.25", "9.75 mm held out") if t not in section
+    ] == []
+
+
 def test_absent_and_unreadable(tmp_path):
     assert refine_section(tmp_path) is None
     write(tmp_path, document(), fields())

@@ -10,6 +10,7 @@ import torch
 from masiv.continuum.trajectory import Trajectory
 from masiv.effects.active import ActiveEffects
 from masiv.effects.effect import Setting
+from masiv.effects.library import effect_named
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.law import Law
 from masiv.mpm.config import SimulatorConfig
@@ -19,6 +20,7 @@ from masiv.mpm.simulate import thrown
 from masiv.mpm.simulator import Simulator
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import SimulationFrame
+from masiv.twin import TwinEffect
 
 
 @dataclass
@@ -39,7 +41,7 @@ class Problem:
 
     ``particles`` of the trajectory are used (all where None); targets (F * samples, N, 3) [m] are their positions in
     the simulation frame at ``samples_per_frame`` instants a frame, the start left out. chosen (N,): which particles of
-    the trajectory they are.
+    the trajectory they are. known: effects that act in every rollout which is given none.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Problem:
         *,
         particles: int | None = None,
         seed: int = 0,
+        known: tuple[TwinEffect, ...] = (),
     ) -> None:
         self.scene = scene
         self.config = config
@@ -74,6 +77,8 @@ class Problem:
         self.size = float((self.start - self.start.mean(0)).norm(dim=1).quantile(0.9)) * 2
         span = torch.cat([self.start[None], moved])
         self.speed = float((span[1:] - span[:-1]).norm(dim=2).max()) * self.samples * scene.fps
+        members = tuple((effect_named(e.name), torch.tensor([v for _, v, *_ in e.rows()])) for e in known)
+        self.known = ActiveEffects(members, self.setting()) if members else None
 
     def substeps(self, law: Law) -> int:
         """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number."""
@@ -113,7 +118,9 @@ class Problem:
         effects: ActiveEffects | None = None,
     ) -> torch.Tensor:
         """Positions (frames * samples, N, 3) [m, simulation frame of the scene], differentiable. steps: substeps a
-        frame, a multiple of ``samples``; as many as the law needs where None. Raises NonFiniteError."""
+        frame, a multiple of ``samples``; as many as the law needs where None. effects: those that are known where None.
+        Raises NonFiniteError."""
+        effects = effects or self.known
         steps = steps or self.substeps(law)
         simulator = Simulator(
             particle_count=self.count,

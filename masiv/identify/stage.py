@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -95,6 +96,46 @@ def _identify(
             "frames": scene.frame_count,
             "history": found.history,
         },
+    )
+
+
+def relearn(
+    twin: Twin,
+    scene: Scene,
+    trajectory: Trajectory,
+    config: IdentifyConfig,
+    *,
+    seed: int = 0,
+    checkpoint: Checkpoint | None = None,
+    progress: Progress = silent,
+) -> Twin:
+    """``twin`` with a neural law that is learnt beside its effects, which stay as they are, from its throw on.
+
+    Raises MasivError where no law explains ``trajectory``.
+    """
+    made = functools.partial(Problem, scene, trajectory, config, twin.simulator, known=twin.effects)
+    problem, few = made(), functools.partial(made, particles=config.search_particles, seed=seed)
+    axes = problem.axes
+    raised = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
+    motion = Motion(
+        torch.as_tensor(axes.vectors_to_simulation(twin.velocity), dtype=torch.float32),
+        torch.as_tensor(axes.vectors_to_simulation(twin.omega), dtype=torch.float32),
+        torch.tensor(raised, dtype=torch.float32),
+    )
+    with runtime.torch_threads(1):
+        frames = min((problem.frames + 1) // 2, problem.frames)
+        found = _neural(problem, few, motion, frames, seed, checkpoint or Checkpoint(None), progress)
+    ground = scene.ground
+    if ground is not None:
+        ground = Ground(ground.normal, ground.height + float(found.motion.ground_offset))
+    return replace(
+        twin,
+        velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
+        omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
+        ground=ground,
+        contact=found.contact,
+        law=found.law,
+        fit={**twin.fit, **found.report, "trajectory_error_mm": 1e3 * found.error_m, "history": found.history},
     )
 
 

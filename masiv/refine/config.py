@@ -15,12 +15,17 @@ class RefineConfig(BaseModel):
     samples_per_frame: int = Field(2, ge=1, le=16, description="instants per frame at which motions are compared")
     families: int = Field(2, ge=1, description="classical laws that compete, the best by their fit without any effect")
     laws: list[str] = Field([], description="families that compete; all where empty")
+    effects: list[str] = Field([], description="effects that are considered; the whole library where empty")
     baseline_rollouts: int = Field(45, ge=2, description="rollouts of each stage of a law's fit without effects")
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
     above_noise: float = Field(
         1.2, ge=0, description="residual over what noise and grid explain, below which nothing is looked for"
     )
+    tracking_error: float = Field(
+        0.4, ge=0, le=1,
+        description="how far points that are followed in pictures are off, over how far they left a rigid motion",
+    )  # fmt: skip
     unexplained: float = Field(
         3.0, ge=1, description="residual over the same floor from which it is called unexplained, not nothing"
     )

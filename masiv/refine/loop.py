@@ -10,7 +10,7 @@ import numpy as np
 
 from masiv.errors import MasivError
 from masiv.refine.config import RefineConfig
-from masiv.refine.noise import uncertainty
+from masiv.refine.noise import uncertainties
 from masiv.refine.refit import Fitted, chord_fit, column, full_fit, reweighted, softness, summarised
 from masiv.refine.score import Candidate, alike, score
 from masiv.refine.simulated import Simulated, Term, Watched
@@ -20,6 +20,8 @@ CHORD_STEPS = 8
 STOP_GAP = "smooth_force"
 SOFT = 5.0
 """Sizes of the noise from which a weighted residual counts as wild, at the least."""
+SIMPLER = 0.25
+"""Variance, over that of noise and grid, that tells nothing."""
 CERTAIN = 1.5
 """Times the noise that sigma is where the motion is as well simulated as it is observed."""
 TELLS_APART = 6.0
@@ -82,6 +84,13 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
             break
         current = done.accepted.fitted
         rivals = [current]
+    left, there_was = excess(current, experiments), excess(before, experiments)
+    if current is not before and left > max(config.unexplained, there_was / 2):
+        for done in rounds:  # no name for what it does not explain
+            if done.accepted is not None:
+                done.accepted.reasons.append(f"it leaves a residual of {left:.1f} times what noise and grid explain")
+                done.accepted = None
+        current = before
     gap = None
     if config.shortlist and excess(current, experiments) > config.unexplained:
         gap = stop_gap(simulation, current, soft, config, say)
@@ -107,10 +116,8 @@ def stop_gap(simulation: Simulated, current: Fitted, soft: float, config: Refine
 
 def weigh(simulation: Simulated, fitted: Fitted) -> None:
     """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves."""
-    model, values = fitted.model, fitted.values
-    simulation.experiments = tuple(
-        replace(e, sigma=uncertainty(simulation, model, values, k)) for k, e in enumerate(simulation.experiments)
-    )
+    sigma = uncertainties(simulation, fitted)
+    simulation.experiments = tuple(replace(e, sigma=s) for e, s in zip(simulation.experiments, sigma, strict=True))
 
 
 def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:
@@ -157,7 +164,7 @@ def _round(
         early = simulation.early(base)
         start = base if not early else _carried(early[0], base, soft)
         candidates = score(
-            early[0] if early else simulation, start, soft=soft, names=names or None,
+            early[0] if early else simulation, start, soft=soft, names=names or config.effects or None,
             progress=lambda n, i, k, label=label: say(label, i, k, n),
         )  # fmt: skip
         say(label, 1, 1, candidates[0].effect if candidates else "none")
@@ -175,15 +182,16 @@ def _round(
                 say(label, done, len(worth), f"{candidate.effect}: {failed}")
         if worth:
             say(f"refine: fit effects, {base.model.family.kind}", len(worth), len(worth), "")
-    rank = {id(f): k for k, f in enumerate(ordered([t.fitted for t in trials]))}
-    trials.sort(key=lambda t: rank[id(t.fitted)])
+    _rank(trials)
+    if trials:
+        _second_chance(simulation, trials, soft, say)
+        _rank(trials)
     confusable = _confusable(ranking, trials, config.confusable)
     accepted = None
     for trial in trials:
         trial.reasons = _reasons(simulation, current, trial, config)
-    for k, trial in enumerate(t for t in trials if t.passes):
-        if k > 0:
-            break
+    trial = _simplest([t for t in trials if t.passes], simulation.experiments)
+    if trial is not None:
         final = full_fit(
             simulation, trial.fitted.model, trial.fitted.values,
             budget=2 * len(trial.fitted.parameters) + 6, soft=soft,
@@ -192,6 +200,43 @@ def _round(
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
+
+
+def _rank(trials: list[Trial]) -> None:
+    rank = {id(f): k for k, f in enumerate(ordered([t.fitted for t in trials]))}
+    trials.sort(key=lambda t: rank[id(t.fitted)])
+
+
+def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, say: Say) -> None:
+    """Fit what is simpler than the best trial, with the same law, again from where the best one ended: a flexible cause
+    that found the right law and launch must not win for that alone."""
+    best = trials[0].fitted
+    simpler = [
+        t for t in trials[1:]
+        if t.fitted.model.family.kind == best.model.family.kind and len(t.fitted.parameters) < len(best.parameters)
+    ]  # fmt: skip
+    for done, trial in enumerate(simpler):
+        say("refine: fit simpler effects again", done, len(simpler), trial.candidate.effect)
+        shared = {p.name for p in trial.fitted.parameters} & {p.name for p in best.parameters}
+        values = {**trial.fitted.values, **{name: best.values[name] for name in shared}}
+        budget = 2 * (len(trial.fitted.parameters) + 2)
+        try:
+            again = full_fit(simulation, trial.fitted.model, values, budget=budget, soft=soft)
+        except MasivError:
+            continue
+        trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
+
+
+def _simplest(passing: Sequence[Trial], experiments: Sequence[Watched]) -> Trial | None:
+    """Of trials, best first, the one with the fewest parameters that explains what the best one does, but for less than
+    noise and grid could change."""
+
+    def lacks(trial: Trial) -> float:
+        squares = zip(trial.fitted.squares, passing[0].fitted.squares, experiments, strict=True)
+        return max(_phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments))
+
+    enough = [t for t in passing if lacks(t) < SIMPLER]
+    return min(enough, key=lambda t: len(t.fitted.parameters), default=None)
 
 
 def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
@@ -272,7 +317,7 @@ def _held_out(
     won = np.concatenate([gained[k][experiments[k].rows :] for k in rest])
     old = np.concatenate([(before.squares[k] / experiments[k].sigma ** 2)[experiments[k].rows :] for k in rest])
     removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
-    if won.mean() >= 1 and removed >= config.least_gain:
+    if won.mean() >= SIMPLER and removed >= config.least_gain:
         return []
     if abs(won.mean()) < 1 and _phases(gained, experiments)[0] >= config.decisive:
         return []  # they cannot tell, where the body flies or is otherwise well simulated it is plain

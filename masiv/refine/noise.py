@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from masiv.refine.model import Model
+from masiv.refine.refit import Fitted
 from masiv.refine.simulated import Simulated
 
 
@@ -14,25 +14,56 @@ def noise_floor(positions: np.ndarray, last_frame: int) -> float:
     1…last_frame-1 of free flight.
 
     A body at rest within that is thrown stays rigid until it touches something, whatever drag or wind does to it: what
-    is not rigid is the error of the observation. Rigid errors are not seen, so it is a lower bound. Where the body
-    touches at once, frame 1 has to do.
+    is not rigid is the error of the observation. Rigid errors are not seen; with errors that are smooth over the body
+    they are taken to be as large again. Where the body touches at once, frame 1 has to do.
     """
+    return float(np.sqrt(2 * np.mean(beyond_rigid(positions[: max(2, last_frame)]) ** 2)))
+
+
+def beyond_rigid(positions: np.ndarray) -> np.ndarray:
+    """Root mean square distance (T - 1,) [m] of positions (T, N, 3) [m] after the first from its best rigid motion."""
     start = positions[0] - positions[0].mean(0)
-    squares = []
-    for k in range(1, max(2, last_frame)):
-        now = positions[k] - positions[k].mean(0)
+    out = []
+    for later in positions[1:]:
+        now = later - later.mean(0)
         turn = Rotation.align_vectors(now, start)[0]
-        squares.append(((now - turn.apply(start)) ** 2).sum(1).mean())
-    return float(np.sqrt(np.mean(squares)))
+        out.append(np.sqrt(((now - turn.apply(start)) ** 2).sum(1).mean()))
+    return np.array(out)
 
 
-def uncertainty(simulation: Simulated, model: Model, values: dict[str, float], index: int) -> np.ndarray:
-    """Root mean square distance (K,) [m] by which model and observation of experiment ``index`` may differ at each
-    instant with nothing missing: noise, and what a finer grid changes. In free flight that is the noise alone.
+def uncertainties(simulation: Simulated, fitted: Fitted) -> list[np.ndarray]:
+    """For each experiment, the root mean square distance (K,) [m] by which model and observation may differ at each
+    instant with nothing missing: their sigma so far, of the observation, and what a finer grid changes and no fit could
+    absorb. In free flight that is nothing.
 
-    Not less than before as time goes on, since errors of the simulation grow. Raises NonFiniteError.
+    What a fit absorbs is the change's part along the derivatives of ``fitted``; after the fitted instants, the same
+    share as at the end of these is taken to be absorbed. Not less than before as time goes on, since errors of the
+    simulation grow. Raises NonFiniteError.
     """
-    experiment = simulation.experiments[index]
-    change = simulation.finer_grid(model, values, index)
-    grid = np.zeros(experiment.instants) if change is None else np.sqrt((change**2).sum(2).mean(1))
-    return np.hypot(experiment.noise, np.maximum.accumulate(grid))
+    experiments = simulation.experiments
+    changes = []
+    for index, experiment in enumerate(experiments):
+        change = simulation.finer_grid(fitted.model, fitted.values, index)
+        changes.append(np.zeros((experiment.instants, 1, 1)) if change is None else change)
+    whole = [np.sqrt((change**2).sum(2).mean(1)) for change in changes]
+    if not any(size.any() for size in whole):
+        return [e.sigma for e in experiments]
+    weights = [e.noise / np.hypot(e.sigma, np.maximum.accumulate(s)) for s, e in zip(whole, experiments, strict=True)]
+    rows = [c[: e.rows] * w[: e.rows, None, None] for c, w, e in zip(changes, weights, experiments, strict=True)]
+    counts = [part.size for part in rows]
+    # The derivatives are weighted by the sigma so far.
+    more = [(w * e.sigma / e.noise)[: e.rows] for w, e in zip(weights, experiments, strict=True)]
+    each = np.concatenate([np.repeat(m, n // len(m)) for m, n in zip(more, counts, strict=True)])
+    jacobian = fitted.jacobian * each[:, None]
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    flat = np.concatenate([part.ravel() for part in rows])
+    left = flat - jacobian @ (np.linalg.lstsq(jacobian / scale, flat, rcond=1e-8)[0] / scale)
+    out = []
+    for part, size, weight, experiment, mine in zip(
+        rows, whole, weights, experiments, np.split(left, np.cumsum(counts)[:-1]), strict=True
+    ):
+        kept = np.sqrt((mine.reshape(part.shape) ** 2).sum(2).mean(1)) / weight[: experiment.rows]
+        share = min(float(kept[-1] / max(size[experiment.rows - 1], 1e-300)), 1.0)
+        grid = np.concatenate([np.minimum(kept, size[: experiment.rows]), share * size[experiment.rows :]])
+        out.append(np.hypot(experiment.sigma, np.maximum.accumulate(grid)))
+    return out

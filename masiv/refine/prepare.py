@@ -11,7 +11,7 @@ from masiv.identify.problem import Motion, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Experiment
-from masiv.refine.noise import noise_floor
+from masiv.refine.noise import beyond_rigid, noise_floor
 from masiv.refine.observed import Observed
 from masiv.scene.scene import Scene
 
@@ -54,7 +54,9 @@ def experiment_of(
         torch.zeros(()),
     )
     noise = max(noise_floor(fitted.positions, launch.last_frame), LEAST_NOISE)
-    sigma = np.full(len(problem.targets), noise)
+    seen = torch.cat([problem.start[None], problem.targets]).double().numpy()
+    lost = config.tracking_error * beyond_rigid(seen) if scene.cameras else np.zeros(len(problem.targets))
+    sigma = np.hypot(noise, np.maximum.accumulate(lost))
     return Experiment(name, problem, len(fitted.times), motion, fine, noise, sigma), few, fewer, launch
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
+from masiv.effects.library import effect_named
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.families import law_of
 from masiv.mpm.config import SimulatorConfig
@@ -76,8 +77,10 @@ def refine(
     """Look for what the model lacks. throws: of one body, the first to be refined. start: the twin's pretrained law,
     which chooses the competing classical laws unless ``config.laws`` does. dry_run: rank the effects, fit none.
 
-    Raises MasivError where no classical law explains the motion.
+    Raises InputError for an unknown effect in ``config.effects``, MasivError where no law explains the motion.
     """
+    for name in config.effects:
+        effect_named(name)
     with runtime.torch_threads(1):
         if not config.laws and start in COMPETITORS:
             config = config.model_copy(update={"laws": list(COMPETITORS[start])})
@@ -102,7 +105,8 @@ def refine(
             config = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
         outcome = close_loop(simulation, fits, config, progress)
         before = simulation.fields(outcome.before.model, outcome.before.values, held_out=True)
-        after = simulation.fields(outcome.after.model, outcome.after.values, held_out=True)
+        final = outcome.gap or outcome.after
+        after = simulation.fields(final.model, final.values, held_out=True)
         proposal = None if dry_run else propose(simulation, outcome, progress)
         return Refined(outcome, simulation, before, after, proposal)
 

@@ -57,7 +57,7 @@ def refine_section(run: Path, up: np.ndarray | None = None) -> str | None:
     _refits(page, document["rounds"])
     _before_after(page, document["before"], document["after"])
     _accepted(page, document["accepted"])
-    _unexplained(page, document["unexplained"])
+    _unexplained(page, document["unexplained"], document.get("stop_gap"))
     _next_throw(page, document.get("next_experiment"))
     return "".join(page.parts)
 
@@ -188,7 +188,7 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
     page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
 
 
-def _unexplained(page: Page, left: Mapping[str, Any]) -> None:
+def _unexplained(page: Page, left: Mapping[str, Any], gap: Mapping[str, Any] | None) -> None:
     page.subheading("What stays unexplained")
     page.table(
         ["quantity", "value", "unit"],
@@ -201,6 +201,14 @@ def _unexplained(page: Page, left: Mapping[str, Any]) -> None:
             ["residual of that tenth, RMS", _number(left["worst_place_rmse_mm"]), "mm"],
         ],
     )
+    if gap is not None:
+        errors = f"{number(_number(gap['fit_rmse_mm']))} mm"
+        if gap["held_out_rmse_mm"] is not None:
+            errors += f", {number(_number(gap['held_out_rmse_mm']))} mm held out"
+        page.note(
+            "Stop-gap, not an explanation: a force that changes smoothly in time and space, without a known cause, "
+            f"leaves {errors}. The twin has it as smooth force, to be used meanwhile; it holds for this throw alone."
+        )
 
 
 def _next_throw(page: Page, proposal: Mapping[str, Any] | None) -> None:

@@ -1,0 +1,82 @@
+"""Does the learnt law swallow an effect, and does refine prevent it? One material, with and without drag.
+
+    python benchmarks/hidden_in_law.py
+
+Laws are learnt from simulated throws of one elastic body (tracks with correlated noise of 2 mm): from a throw without
+drag; from one with drag, which the model is not told; and from the latter after refine, beside what it found.
+A law that swallowed the drag has other stresses over the strains that were observed. Printed: RMS differences of
+uniaxial stress, in tension and compression, in percent of that of another law; and the error against the motion.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+FRAMES, STRAIN = 12, 0.12
+
+
+def main():
+    import torch
+    from refine_tracks import ELASTIC, quiet
+    from track_cases import Case, observed
+
+    from masiv import runtime
+    from masiv.config import load_config
+    from masiv.identify.stage import identify, relearn
+    from masiv.materials.classical import ClassicalLaw
+    from masiv.refine.config import RefineConfig
+    from masiv.refine.observed import SampledMotion
+    from masiv.refine.stage import Throw, refine, twin_of
+    from masiv.refine.summary import summary
+
+    runtime.start("cpu")
+    torch.set_num_threads(1)
+    settings = load_config(preset="quick")
+    config = settings.identify.model_copy(update={"silhouette_weight": 0.0, "contact": "sticky"})
+    kind, parameters = ELASTIC
+    laws, errors = {"truth": ClassicalLaw(kind, **parameters)}, {}
+
+    def cut(scene, motion):
+        seen = scene.restricted(FRAMES)
+        return seen, SampledMotion(motion.positions[:FRAMES], motion.times[:FRAMES], motion.volume)
+
+    for name, effects in (("no drag", {}), ("drag, not told", {"linear_drag": {"rate": 0.8}})):
+        scene, motion = observed(Case(name, kind, parameters, effects, seed=5))
+        seen, fitted = cut(scene, motion)
+        twin = identify(seen, fitted, config, settings.simulator, seed=0, progress=quiet)
+        laws[name], errors[name] = twin.law, twin.fit["trajectory_error_mm"]
+    wanted = RefineConfig.model_validate({"particles": 800, "laws": [kind]})
+    throw = Throw("drag", scene, fitted, motion, FRAMES)
+    found = refine([throw], config, settings.simulator, wanted, progress=quiet)
+    document = summary(found, wanted, dry_run=False)
+    print("refine:", document["verdict"], [(a["effect"], a["theta"], a["stderr"]) for a in document["accepted"]])
+    refined = twin_of(found.outcome.after, throw, found.simulation, twin)
+    laws["drag, refine's classical law"] = refined.law
+    again = relearn(refined, seen, fitted, config, seed=0, progress=quiet)
+    laws["drag, learnt anew beside the effect"] = again.law
+    errors["drag, learnt anew beside the effect"] = again.fit["trajectory_error_mm"]
+
+    curves = {name: stresses(law) for name, law in laws.items()}
+    print(
+        "| law | against that without drag | against the truth | mean distance to the motion [mm] |\n|---|---|---|---|"
+    )
+    for name, curve in curves.items():
+        cells = [f"{100 * apart(curve, curves[other]):.1f} %" for other in ("no drag", "truth")]
+        print(f"| {name} | {cells[0]} | {cells[1]} | {errors.get(name, float('nan')):.1f} |")
+
+
+def stresses(law):
+    """Axial Kirchhoff stress [Pa] over strains up to STRAIN in tension and compression, a second there and back."""
+    from masiv.materials.curves import there_and_back, uniaxial
+
+    return np.concatenate([uniaxial(law, there_and_back(s, 20), 0.025).stress for s in (STRAIN, -STRAIN)])
+
+
+def apart(curve, other):
+    return float(np.sqrt(((curve - other) ** 2).mean() / (other**2).mean()))
+
+
+if __name__ == "__main__":
+    main()
