@@ -241,7 +241,7 @@ def _simplest(passing: Sequence[Trial], experiments: Sequence[Watched]) -> Trial
 
 def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
     """``fitted`` as a start in another simulation of the same experiments."""
-    budget = 2 * (len(fitted.parameters) + 1)
+    budget = 4 * (len(fitted.parameters) + 1)
     return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft)
 
 
