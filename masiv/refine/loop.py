@@ -11,7 +11,17 @@ import numpy as np
 from masiv.errors import MasivError
 from masiv.refine.config import RefineConfig
 from masiv.refine.noise import uncertainties
-from masiv.refine.refit import Fitted, chord_fit, column, full_fit, reweighted, softness, summarised
+from masiv.refine.refit import (
+    Fitted,
+    chord_fit,
+    column,
+    full_fit,
+    leapt,
+    reweighted,
+    softness,
+    strengths_alone,
+    summarised,
+)
 from masiv.refine.score import Candidate, alike, score
 from masiv.refine.simulated import Simulated, Term, Watched
 
@@ -219,8 +229,10 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
         say("refine: fit simpler effects again", done, len(simpler), trial.candidate.effect)
         shared = {p.name for p in trial.fitted.parameters} & {p.name for p in best.parameters}
         values = {**trial.fitted.values, **{name: best.values[name] for name in shared}}
+        strengths = simulation.term(trial.candidate.effect).strengths
         budget = 2 * (len(trial.fitted.parameters) + 2)
         try:
+            values = strengths_alone(simulation, trial.fitted.model, values, strengths, soft)
             again = full_fit(simulation, trial.fitted.model, values, budget=budget, soft=soft)
         except MasivError:
             continue
@@ -255,8 +267,9 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
     jacobian = _assembled(first, base, candidate, [p.name for p in term.strengths])
     others = {p.name: candidate.theta[p.name] for p in term.others}
     values = {**base.values, **{p.name: 0.0 for p in term.strengths}, **others}
+    values, residual, jacobian = leapt(simulation, model, first, values, base.residual, jacobian, soft=soft)
     values, residual, jacobian = chord_fit(
-        simulation, model, first, values, base.residual, jacobian, steps=CHORD_STEPS, soft=soft
+        simulation, model, first, values, residual, jacobian, steps=CHORD_STEPS, soft=soft
     )
     for _ in range(2 if others else 0):
         extra = [p for p in params if p.name in others]

@@ -15,6 +15,8 @@ from masiv.refine.model import Model
 from masiv.refine.simulated import Simulated, Watched
 
 LEAST_GAIN = 1e-3
+LOG_LEAP = 0.7
+"""By how much the logarithm of a parameter may change at once."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,49 @@ def chord_fit(
         else:
             damping = min(max(20 * damping, 0.05), 1e6)
     return values, residual, jacobian
+
+
+def leapt(
+    simulation: Simulated,
+    model: Model,
+    params: Sequence[Parameter],
+    values: Mapping[str, float],
+    residual: np.ndarray,
+    jacobian: np.ndarray,
+    *,
+    soft: float,
+) -> tuple[dict[str, float], np.ndarray, np.ndarray]:
+    """Where the linear model has its minimum, if that is better than ``values``: forces are nearly linear, and steps of
+    a careful length might never get there. Returns values, residual and the Jacobian with Broyden's update."""
+    weight = robust_weight(residual, soft)
+    scale = np.array([p.step for p in params])
+    a = (jacobian * scale) * weight[:, None]
+    normal = a.T @ a
+    step = np.linalg.lstsq(normal + 1e-3 * np.diag(np.diag(normal)), a.T @ (-residual * weight), rcond=1e-10)[0] * scale
+    trial = dict(values)
+    for p, delta in zip(params, step, strict=True):
+        limit = LOG_LEAP if p.log else math.inf
+        trial[p.name] = p.value(p.fitted(values[p.name]) + float(np.clip(delta, -limit, limit)))
+    try:
+        found = simulation.residual(model, trial)
+    except NonFiniteError:
+        return dict(values), residual, jacobian
+    if robust_cost(found, soft) >= robust_cost(residual, soft):
+        return dict(values), residual, jacobian
+    actual = np.array([p.fitted(trial[p.name]) - p.fitted(values[p.name]) for p in params])
+    length = actual / scale
+    update = np.outer(found - residual - jacobian @ actual, length / scale) / max(float(length @ length), 1e-300)
+    return trial, found, jacobian + update
+
+
+def strengths_alone(
+    simulation: Simulated, model: Model, values: Mapping[str, float], strengths: Sequence[Parameter], soft: float
+) -> dict[str, float]:
+    """``values`` with the ``strengths`` that are best with all else as it is, of a linear model about none."""
+    absent = {**values, **{p.name: 0.0 for p in strengths}}
+    residual = simulation.residual(model, absent)
+    columns = np.stack([column(simulation, model, absent, residual, p) for p in strengths], axis=1)
+    return leapt(simulation, model, strengths, absent, residual, columns, soft=soft)[0]
 
 
 def reweighted(simulation: Simulated, base: Fitted, *, steps: int, soft: float) -> Fitted:
