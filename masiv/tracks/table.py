@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import struct
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -86,13 +87,9 @@ def read_csv(path: Path, columns: ColumnsDeclaration | None, select: Mapping[str
 
 
 def read_c3d(path: Path) -> Table:
-    """Points of a C3D file. A negative residual marks a gap. Needs the package ``c3d``."""
-    try:
-        import c3d
-    except ImportError as error:
-        raise InputError(
-            f"{path}: reading C3D needs the package c3d: `pip install c3d`, or export the markers as CSV"
-        ) from error
+    """Points of a C3D file. A negative residual marks a gap. Raises InputError for a file that is none."""
+    import c3d
+
     try:
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it warns where there are no analog channels
@@ -102,7 +99,7 @@ def read_c3d(path: Path) -> Table:
             unit = reader.get("POINT:UNITS")
             rate = float(reader.point_rate)
             first = int(reader.first_frame)
-    except (OSError, AssertionError, ValueError, KeyError, IndexError, AttributeError) as error:
+    except (OSError, AssertionError, ValueError, KeyError, IndexError, AttributeError, struct.error) as error:
         raise InputError(f"{path} is not a C3D file that can be read: {error}") from error
     if not frames:
         raise InputError(f"{path} has no frames")
