@@ -19,9 +19,7 @@ class RefineConfig(BaseModel):
     baseline_rollouts: int = Field(45, ge=2, description="rollouts of each stage of a law's fit without effects")
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
-    above_noise: float = Field(
-        1.2, ge=0, description="residual over what noise and grid explain, below which nothing is looked for"
-    )
+    above_noise: float = Field(1.2, ge=0, description="residual over the noise below which nothing is looked for")
     tracking_error: float = Field(
         0.4, ge=0, le=1,
         description="how far points that are followed in pictures are off, over how far they left a rigid motion",
@@ -31,6 +29,9 @@ class RefineConfig(BaseModel):
     )
     least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")
     least_gain: float = Field(0.15, ge=0, le=1, description="share of the held-out error that an effect must remove")
+    decisive_gain: float = Field(
+        0.5, ge=0, le=1, description="share of the held-out error whose removal is enough evidence alone"
+    )
     decisive: float = Field(
         4.0, ge=1,
         description="variance that an effect must explain, over the noise's, in the phase where the simulation is as "

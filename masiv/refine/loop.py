@@ -87,7 +87,7 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
     before = current = rivals[0]
     rounds: list[Round] = []
     experiments = simulation.experiments
-    while len(rounds) < config.max_effects and excess(current, experiments) > config.above_noise:
+    while len(rounds) < config.max_effects and _above_noise(current, experiments, config):
         done = _round(simulation, current, rivals, soft, config, say)
         rounds.append(done)
         if done.accepted is None:
@@ -128,6 +128,12 @@ def weigh(simulation: Simulated, fitted: Fitted) -> None:
     """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves."""
     sigma = uncertainties(simulation, fitted)
     simulation.experiments = tuple(replace(e, sigma=s) for e, s in zip(simulation.experiments, sigma, strict=True))
+
+
+def _above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineConfig) -> bool:
+    """Whether the residual over the fitted instants is above the noise of the observation."""
+    squares = np.concatenate([(s / e.noise**2)[: e.rows] for s, e in zip(fitted.squares, experiments, strict=True)])
+    return math.sqrt(float(squares.mean())) > config.above_noise
 
 
 def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:
@@ -304,13 +310,10 @@ def objections(
     gained = [
         (b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)
     ]  # of the variance that noise and grid would explain
-    share = max(_phases(gained, experiments))
-    if share < 1:
-        out.append(f"it explains {max(share, 0.0):.2g} of what noise and a finer grid alone could change")
     gain = before.bic(after.samples) - after.bic(after.samples)
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
-    out += _held_out(before, after, gained, experiments, config)
+    out += _explains_too_little(before, after, gained, experiments, config)
     sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in term.strengths))
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
@@ -320,24 +323,35 @@ def objections(
     return out
 
 
-def _held_out(
+def _explains_too_little(
     before: Fitted, after: Fitted, gained: Sequence[np.ndarray], experiments: Sequence[Watched], config: RefineConfig
 ) -> list[str]:
-    """What the held-out instants, weighted as the others, say against ``after``."""
+    """What fitted and held-out instants, weighted alike, say against ``after``; gained: variance that it removes, over
+    that of noise and grid.
+
+    Three kinds of evidence are enough: more than noise and grid could change, borne out by held-out instants; held-out
+    instants that are decisive on their own; or held-out instants that cannot tell, and a motion that is plain where the
+    simulation is as certain as the observation.
+    """
+    phases = _phases(gained, experiments)
+    share = max(phases)
+    little = f"it explains {max(share, 0.0):.2g} of what noise and a finer grid alone could change"
     rest = [k for k, e in enumerate(experiments) if e.holds_out]
     if not rest:
-        return []
+        return [] if share >= 1 else [little]
     won = np.concatenate([gained[k][experiments[k].rows :] for k in rest])
     old = np.concatenate([(before.squares[k] / experiments[k].sigma ** 2)[experiments[k].rows :] for k in rest])
     removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
-    if won.mean() >= SIMPLER and removed >= config.least_gain:
+    confirmed = won.mean() >= SIMPLER and removed >= config.least_gain
+    if (confirmed and share >= 1) or (abs(won.mean()) < 1 and phases[0] >= config.decisive):
         return []
-    if abs(won.mean()) < 1 and _phases(gained, experiments)[0] >= config.decisive:
-        return []  # they cannot tell, where the body flies or is otherwise well simulated it is plain
-    return [
+    if won.mean() >= SIMPLER and removed >= config.decisive_gain and share > 0:
+        return []
+    held_out = (
         f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * config.least_gain:.0f} %), "
         f"{max(float(won.mean()), 0.0):.2g} of what noise and a finer grid alone could change there"
-    ]
+    )
+    return [little] * (share < 1) + [held_out] * (not confirmed)
 
 
 def _confusable(ranking: list[Candidate], trials: list[Trial], least: float) -> dict[str, list[str]]:
