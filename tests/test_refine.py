@@ -96,7 +96,11 @@ def test_undeclared_drag_is_named_measured_and_confirmed():
 def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
     other = observed({"body_force": [0.0, 0.0, 2.0]}, velocity=(-0.5, 1.0, 1.0), omega=(0.0, -2.0, 1.0))
     refined, document = found(
-        observed({"body_force": [0.0, 0.0, 2.0]}), other, effects=["body_force", "linear_drag"], max_effects=1
+        observed({"body_force": [0.0, 0.0, 2.0]}),
+        other,
+        effects=["body_force", "linear_drag"],
+        max_effects=1,
+        baseline_rollouts=24,
     )
     assert [a["effect"] for a in document["accepted"]] == ["body_force"]
     assert list(document["accepted"][0]["theta"].values()) == pytest.approx([0, 0, 2], abs=0.1)

@@ -175,7 +175,7 @@ def residual_in_space(
             )  # fmt: skip
             axis.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[upright]} [m]", aspect="equal")
             axis.margins(0.12)
-            axis.set_title(f"{name}; arrows at {times[worst]:.2f} s, longest {1e3 * longest:.2g} mm", fontsize=9)
+            axis.set_title(f"{name}; arrows at {times[worst]:.2f} s, longest {1e3 * longest:.3g} mm", fontsize=9)
             if up is not None and up[upright] < 0:
                 axis.invert_yaxis()
     figure.colorbar(shown, ax=panels, label="residual of a particle, RMS over time [mm]", extend="max", shrink=0.8)
