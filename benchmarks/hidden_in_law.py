@@ -9,6 +9,7 @@ uniaxial stress, in tension and compression, in percent of that of another law; 
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +40,9 @@ def main():
     laws, errors = {"truth": ClassicalLaw(kind, **parameters)}, {}
 
     def cut(scene, motion):
-        seen = scene.restricted(FRAMES)
-        return seen, SampledMotion(motion.positions[:FRAMES], motion.times[:FRAMES], motion.volume)
+        return replace(scene, frame_count=FRAMES), SampledMotion(
+            motion.positions[:FRAMES], motion.times[:FRAMES], motion.volume
+        )
 
     for name, effects in (("no drag", {}), ("drag, not told", {"linear_drag": {"rate": 0.8}})):
         scene, motion = observed(Case(name, kind, parameters, effects, seed=5))
