@@ -1,0 +1,120 @@
+"""Parts of refine on models that are known in closed form, without a simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from masiv.identify.parametric import Parameter
+from masiv.refine.config import RefineConfig
+from masiv.refine.loop import Trial, _explains_too_little, _simplest, excess
+from masiv.refine.noise import uncertainties
+from masiv.refine.refit import leapt, strengths_alone
+
+INSTANTS, ROWS, POINTS = 6, 4, 5
+NOISE = 1e-3
+
+
+@dataclass(frozen=True)
+class Watched:
+    noise: float = NOISE
+    sigma: np.ndarray = None
+    instants: int = INSTANTS
+    rows: int = ROWS
+    holds_out: bool = True
+
+
+class Linear:
+    """residual = matrix @ values - target; a finer grid changes ``change``."""
+
+    def __init__(self, matrix, target, change=None):
+        self.matrix, self.target, self.change = matrix, target, change
+        self.experiments = (Watched(sigma=np.full(INSTANTS, NOISE)),)
+
+    def residual(self, model, values):
+        return self.matrix @ np.array([values["a"], values["b"]]) - self.target
+
+    def finer_grid(self, model, values, index):
+        return self.change
+
+
+def parameters():
+    return [Parameter("a", 0.0, -100.0, 100.0, 1e-3), Parameter("b", 0.0, -100.0, 2.0, 1e-3)]
+
+
+def test_a_leap_ends_in_the_minimum_however_far_and_within_bounds():
+    random = np.random.default_rng(0)
+    matrix = random.normal(size=(30, 2))
+    for truth, found in (([40.0, -7.0], [40.0, -7.0]), ([3.0, 50.0], None)):
+        simulation = Linear(matrix, matrix @ np.array(truth))
+        start = {"a": 0.0, "b": 0.0}
+        values, residual, jacobian = leapt(
+            simulation, None, parameters(), start, simulation.residual(None, start), matrix, soft=1e6
+        )
+        np.testing.assert_allclose(residual, simulation.residual(None, values))
+        if found is not None:
+            assert [values["a"], values["b"]] == pytest.approx(found, rel=1e-2)
+            np.testing.assert_allclose(jacobian, matrix, atol=1e-9)  # it was exact, and stays so
+        else:
+            assert values["b"] == 2.0
+
+
+def test_strengths_are_found_with_the_rest_as_it_is():
+    matrix = np.random.default_rng(1).normal(size=(30, 2))
+    simulation = Linear(matrix, matrix @ np.array([5.0, 1.5]))
+    values = strengths_alone(simulation, None, {"a": 5.0, "b": -30.0}, parameters()[1:], soft=1e6)
+    assert values["a"] == 5.0
+    assert values["b"] == pytest.approx(1.5, rel=2e-3)
+
+
+def test_what_a_fit_absorbs_is_no_uncertainty():
+    random = np.random.default_rng(2)
+    jacobian = random.normal(size=(ROWS * POINTS * 3, 2))
+    absorbed = np.zeros((INSTANTS, POINTS, 3))
+    absorbed[:ROWS] = 1e-2 * (jacobian @ np.array([1.0, -2.0])).reshape(ROWS, POINTS, 3)
+    fitted = SimpleNamespace(jacobian=jacobian, model=None, values={})
+    sizes = np.sqrt((absorbed[:ROWS] ** 2).sum(2).mean(1))
+    assert (sizes > 10 * NOISE).all()
+    (sigma,) = uncertainties(Linear(jacobian, 0.0, absorbed), fitted)
+    np.testing.assert_allclose(sigma, NOISE, rtol=1e-6)
+    other = 1e-2 * random.normal(size=absorbed.shape)
+    (sigma,) = uncertainties(Linear(jacobian, 0.0, other), fitted)
+    rms = np.sqrt((other**2).sum(2).mean(1))
+    assert (sigma[:ROWS] >= 0.8 * rms[:ROWS]).all()
+    assert (np.diff(sigma) >= 0).all()
+    (sigma,) = uncertainties(Linear(jacobian, 0.0, None), fitted)
+    np.testing.assert_array_equal(sigma, NOISE)
+
+
+def fits(*levels, count=3):
+    """As fitted: mean square distances, in units of the noise, over fitted and held-out instants."""
+    squares = NOISE**2 * np.repeat(np.array(levels, dtype=float), [ROWS, INSTANTS - ROWS])
+    return SimpleNamespace(squares=[squares], parameters=[None] * count)
+
+
+def judged(before, after, sigma=NOISE):
+    experiments = [Watched(sigma=np.full(INSTANTS, sigma))]
+    gained = [(b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)]
+    return _explains_too_little(before, after, gained, experiments, RefineConfig.model_validate({}))
+
+
+def test_evidence():
+    assert judged(fits(9, 9), fits(1, 1)) == []
+    assert "of what noise" in judged(fits(1.6, 1.6), fits(1.0, 1.5))[0]  # less than noise
+    assert "held-out" in judged(fits(9, 20), fits(6, 22))[0]  # held-out instants contradict
+    assert judged(fits(9, 20), fits(2, 20)) == []  # they cannot tell, the fitted ones are plain
+    assert "held-out" in judged(fits(9, 20), fits(6, 20))[0]  # not plain enough for that
+    assert judged(fits(2, 20), fits(1.5, 3)) == []  # they are decisive
+
+
+def test_of_causes_that_explain_as_much_the_simplest():
+    experiments = [Watched(sigma=np.full(INSTANTS, NOISE))]
+    rich, plain, poor = (Trial(None, f) for f in (fits(1.0, 1, count=9), fits(1.1, 1, count=4), fits(3, 1, count=2)))
+    assert _simplest([rich, plain, poor], experiments) is plain
+    assert _simplest([], experiments) is None
+    uncertain = [replace(experiments[0], sigma=np.full(INSTANTS, 10 * NOISE))]
+    assert _simplest([rich, plain, poor], uncertain) is poor
+    assert excess(fits(9, 1), experiments) == pytest.approx(3.0)
