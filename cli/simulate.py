@@ -68,24 +68,23 @@ def simulate(
     from . import stages, tracked
     from .console import progress_bar
 
+    thrown = vector(velocity, "--velocity"), vector(omega, "--omega"), vector(gravity, "--gravity")
     if tracked.is_run(run):
         tracked.refused(
             velocity=velocity, omega=omega, law=law, blend=blend, geometry=geometry, density=density, ground=ground,
             force=force, force_from=force_from, force_until=force_until, render=render, view=view,
         )  # fmt: skip
         opened = tracked.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
-        pull = vector(gravity, "--gravity")
         return tracked.simulate(
             *opened,
             frames=frames,
-            gravity=pull,
+            gravity=thrown[2],
             without=without or [],
             condition=condition,
             out=out or run / "simulate",
         )
     if condition is not None:
         raise InputError(f"{run} is of a scene of pictures: --condition is for tracks")
-    thrown = vector(velocity, "--velocity"), vector(omega, "--omega"), vector(gravity, "--gravity")
     folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
     folder.require("identify")
     views = view or [0]
