@@ -81,7 +81,8 @@ def refined(case, particles, laws):
     from masiv.mpm.config import SimulatorConfig
     from masiv.refine.baselines import baselines
     from masiv.refine.config import RefineConfig
-    from masiv.refine.loop import close_loop, excess
+    from masiv.refine.evidence import excess
+    from masiv.refine.loop import close_loop
     from masiv.refine.model import Simulation
     from masiv.refine.observed import SampledMotion
     from masiv.refine.prepare import experiment_of

@@ -10,7 +10,7 @@ import pytest
 
 from masiv.identify.parametric import Parameter
 from masiv.refine.config import RefineConfig
-from masiv.refine.loop import Trial, _explains_too_little, _simplest, excess
+from masiv.refine.evidence import excess, explains_too_little, simplest
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import leapt, strengths_alone
 
@@ -97,8 +97,7 @@ def fits(*levels, count=3):
 
 def judged(before, after, sigma=NOISE):
     experiments = [Watched(sigma=np.full(INSTANTS, sigma))]
-    gained = [(b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)]
-    return _explains_too_little(before, after, gained, experiments, RefineConfig.model_validate({}))
+    return explains_too_little(before, after, experiments, RefineConfig.model_validate({}))
 
 
 def test_evidence():
@@ -108,13 +107,15 @@ def test_evidence():
     assert judged(fits(9, 20), fits(2, 20)) == []  # they cannot tell, the fitted ones are plain
     assert "held-out" in judged(fits(9, 20), fits(6, 20))[0]  # not plain enough for that
     assert judged(fits(2, 20), fits(1.5, 3)) == []  # they are decisive
+    # Nothing is plain where the simulation is nowhere as certain as the observation.
+    assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]
 
 
-def test_of_causes_that_explain_as_much_the_simplest():
+def test_of_causes_that_explain_as_much_thesimplest():
     experiments = [Watched(sigma=np.full(INSTANTS, NOISE))]
-    rich, plain, poor = (Trial(None, f) for f in (fits(1.0, 1, count=9), fits(1.1, 1, count=4), fits(3, 1, count=2)))
-    assert _simplest([rich, plain, poor], experiments) is plain
-    assert _simplest([], experiments) is None
+    rich, plain, poor = (fits(1.0, 1, count=9), fits(1.1, 1, count=4), fits(3, 1, count=2))
+    assert simplest([rich, plain, poor], experiments) is plain
+    assert simplest([], experiments) is None
     uncertain = [replace(experiments[0], sigma=np.full(INSTANTS, 10 * NOISE))]
-    assert _simplest([rich, plain, poor], uncertain) is poor
+    assert simplest([rich, plain, poor], uncertain) is poor
     assert excess(fits(9, 1), experiments) == pytest.approx(3.0)

@@ -10,6 +10,7 @@ import numpy as np
 
 from masiv.errors import MasivError
 from masiv.refine.config import RefineConfig
+from masiv.refine.evidence import above_noise, excess, objections, simplest
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import (
     Fitted,
@@ -23,17 +24,13 @@ from masiv.refine.refit import (
     summarised,
 )
 from masiv.refine.score import Candidate, alike, score
-from masiv.refine.simulated import Simulated, Term, Watched
+from masiv.refine.simulated import Simulated
 
 Say = Callable[[str, int, int, str], None]
 CHORD_STEPS = 8
 STOP_GAP = "smooth_force"
 SOFT = 5.0
 """Sizes of the noise from which a weighted residual counts as wild, at the least."""
-SIMPLER = 0.25
-"""Variance, over that of noise and grid, that tells nothing."""
-CERTAIN = 1.5
-"""Times the noise that sigma is where the motion is as well simulated as it is observed."""
 TELLS_APART = 6.0
 """Difference of the information criterion below which two refits explain the data equally well."""
 
@@ -75,7 +72,7 @@ class Outcome:
 
 def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: RefineConfig, say: Say) -> Outcome:
     """Add effects to the best of ``baselines`` (one a law, without effects) until none is confirmed, or the residual is
-    near what noise and grid explain. Gives the experiments of ``simulation`` their sigma."""
+    near the noise. Gives the experiments of ``simulation`` their sigma."""
     least = min(baselines, key=lambda f: f.cost)
     weigh(simulation, least)
     soft = max(softness(simulation.residual(least.model, least.values)), SOFT * simulation.experiments[0].noise)
@@ -87,7 +84,7 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
     before = current = rivals[0]
     rounds: list[Round] = []
     experiments = simulation.experiments
-    while len(rounds) < config.max_effects and _above_noise(current, experiments, config):
+    while len(rounds) < config.max_effects and above_noise(current, experiments, config):
         done = _round(simulation, current, rivals, soft, config, say)
         rounds.append(done)
         if done.accepted is None:
@@ -128,29 +125,6 @@ def weigh(simulation: Simulated, fitted: Fitted) -> None:
     """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves."""
     sigma = uncertainties(simulation, fitted)
     simulation.experiments = tuple(replace(e, sigma=s) for e, s in zip(simulation.experiments, sigma, strict=True))
-
-
-def _above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineConfig) -> bool:
-    """Whether the residual over the fitted instants is above the noise of the observation."""
-    squares = np.concatenate([(s / e.noise**2)[: e.rows] for s, e in zip(fitted.squares, experiments, strict=True)])
-    return math.sqrt(float(squares.mean())) > config.above_noise
-
-
-def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:
-    """Root mean square residual over the fitted instants in units of sigma, in the phase of the motion (well known, or
-    not) where it is largest: about 1 where nothing is missing."""
-    return math.sqrt(max(_phases([s / e.sigma**2 for s, e in zip(fitted.squares, experiments, strict=True)],
-                                 experiments)))  # fmt: skip
-
-
-def _phases(ratios: Sequence[np.ndarray], experiments: Sequence[Watched]) -> list[float]:
-    """Means of ``ratios`` (K,) over fitted instants whose sigma is hardly more than the noise, and over the others."""
-    known, rest = [], []
-    for ratio, e in zip(ratios, experiments, strict=True):
-        certain = e.sigma[: e.rows] < CERTAIN * e.noise
-        known.append(ratio[: e.rows][certain])
-        rest.append(ratio[: e.rows][~certain])
-    return [float(found.mean()) for found in (np.concatenate(known), np.concatenate(rest)) if len(found)]
 
 
 def ordered(fits: Sequence[Fitted]) -> list[Fitted]:
@@ -206,8 +180,9 @@ def _round(
     accepted = None
     for trial in trials:
         trial.reasons = _reasons(simulation, current, trial, config)
-    trial = _simplest([t for t in trials if t.passes], simulation.experiments)
-    if trial is not None:
+    chosen = simplest([t.fitted for t in trials if t.passes], simulation.experiments)
+    if chosen is not None:
+        trial = next(t for t in trials if t.fitted is chosen)
         final = full_fit(
             simulation, trial.fitted.model, trial.fitted.values,
             budget=2 * len(trial.fitted.parameters) + 6, soft=soft,
@@ -243,18 +218,6 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
         except MasivError:
             continue
         trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
-
-
-def _simplest(passing: Sequence[Trial], experiments: Sequence[Watched]) -> Trial | None:
-    """Of trials, best first, the one with the fewest parameters that explains what the best one does, but for less than
-    noise and grid could change."""
-
-    def lacks(trial: Trial) -> float:
-        squares = zip(trial.fitted.squares, passing[0].fitted.squares, experiments, strict=True)
-        return max(_phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments))
-
-    enough = [t for t in passing if lacks(t) < SIMPLER]
-    return min(enough, key=lambda t: len(t.fitted.parameters), default=None)
 
 
 def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
@@ -300,58 +263,6 @@ def _reasons(simulation: Simulated, before: Fitted, trial: Trial, config: Refine
     term = simulation.term(trial.candidate.effect)
     general = objections(before, trial.fitted, term, simulation.experiments, config)
     return [*general, *simulation.objections(before, trial.fitted, term, config)]
-
-
-def objections(
-    before: Fitted, after: Fitted, term: Term, experiments: Sequence[Watched], config: RefineConfig
-) -> list[str]:
-    """Why ``term`` is not accepted; empty where it is."""
-    out = []
-    gained = [
-        (b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)
-    ]  # of the variance that noise and grid would explain
-    gain = before.bic(after.samples) - after.bic(after.samples)
-    if gain < config.least_bic:
-        out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
-    out += _explains_too_little(before, after, gained, experiments, config)
-    sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in term.strengths))
-    if not sigmas >= config.least_sigmas:
-        out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
-    for p in term.parameters:
-        if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper):
-            out.append(f"{p.name} runs into the bound of what is possible, {p.upper:g}")
-    return out
-
-
-def _explains_too_little(
-    before: Fitted, after: Fitted, gained: Sequence[np.ndarray], experiments: Sequence[Watched], config: RefineConfig
-) -> list[str]:
-    """What fitted and held-out instants, weighted alike, say against ``after``; gained: variance that it removes, over
-    that of noise and grid.
-
-    Three kinds of evidence are enough: more than noise and grid could change, borne out by held-out instants; held-out
-    instants that are decisive on their own; or held-out instants that cannot tell, and a motion that is plain where the
-    simulation is as certain as the observation.
-    """
-    phases = _phases(gained, experiments)
-    share = max(phases)
-    little = f"it explains {max(share, 0.0):.2g} of what noise and a finer grid alone could change"
-    rest = [k for k, e in enumerate(experiments) if e.holds_out]
-    if not rest:
-        return [] if share >= 1 else [little]
-    won = np.concatenate([gained[k][experiments[k].rows :] for k in rest])
-    old = np.concatenate([(before.squares[k] / experiments[k].sigma ** 2)[experiments[k].rows :] for k in rest])
-    removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
-    confirmed = won.mean() >= SIMPLER and removed >= config.least_gain
-    if (confirmed and share >= 1) or (abs(won.mean()) < 1 and phases[0] >= config.decisive):
-        return []
-    if won.mean() >= SIMPLER and removed >= config.decisive_gain and share > 0:
-        return []
-    held_out = (
-        f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * config.least_gain:.0f} %), "
-        f"{max(float(won.mean()), 0.0):.2g} of what noise and a finer grid alone could change there"
-    )
-    return [little] * (share < 1) + [held_out] * (not confirmed)
 
 
 def _confusable(ranking: list[Candidate], trials: list[Trial], least: float) -> dict[str, list[str]]:

@@ -11,7 +11,8 @@ import numpy as np
 
 from masiv.effects.library import effect_named
 from masiv.refine.config import RefineConfig
-from masiv.refine.loop import STOP_GAP, Round, excess
+from masiv.refine.evidence import excess
+from masiv.refine.loop import STOP_GAP, Round
 from masiv.refine.refit import Fitted, rms_mm, split
 from masiv.refine.score import Candidate
 from masiv.refine.simulated import Term

@@ -11,7 +11,8 @@ import numpy as np
 from masiv.errors import InputError, MasivError
 from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
-from masiv.refine.loop import Outcome, close_loop, objections
+from masiv.refine.evidence import objections
+from masiv.refine.loop import Outcome, close_loop
 from masiv.refine.model import Model
 from masiv.refine.refit import Fitted, full_fit, softness
 from masiv.refine.simulated import Term

@@ -1,0 +1,116 @@
+"""What is evidence that a model lacks an effect: residuals against what noise and grid could do, and held-out data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from masiv.refine.config import RefineConfig
+from masiv.refine.refit import Fitted
+from masiv.refine.simulated import Term, Watched
+
+SIMPLER = 0.25
+"""Variance, over that of noise and grid, that tells nothing."""
+CERTAIN = 1.5
+"""Times the noise that sigma is where the motion is as well simulated as it is observed."""
+
+
+@dataclass(frozen=True)
+class Phases:
+    """Means over fitted instants: those that are simulated as well as they are observed, and the others. None: there
+    are none of that kind."""
+
+    certain: float | None
+    uncertain: float | None
+
+    @property
+    def largest(self) -> float:
+        return max(mean for mean in (self.certain, self.uncertain) if mean is not None)
+
+
+def phases(ratios: Sequence[np.ndarray], experiments: Sequence[Watched]) -> Phases:
+    """Of ``ratios`` (K,) of each experiment over its instants."""
+    certain, uncertain = [], []
+    for ratio, e in zip(ratios, experiments, strict=True):
+        known = e.sigma[: e.rows] < CERTAIN * e.noise
+        certain.append(ratio[: e.rows][known])
+        uncertain.append(ratio[: e.rows][~known])
+    means = (float(part.mean()) if len(part) else None for part in map(np.concatenate, (certain, uncertain)))
+    return Phases(*means)
+
+
+def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:
+    """Root mean square residual over the fitted instants in units of sigma, in the phase of the motion (well known, or
+    not) where it is largest: about 1 where nothing is missing."""
+    ratios = [s / e.sigma**2 for s, e in zip(fitted.squares, experiments, strict=True)]
+    return math.sqrt(phases(ratios, experiments).largest)
+
+
+def above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineConfig) -> bool:
+    """Whether the residual over the fitted instants is above the noise of the observation."""
+    squares = np.concatenate([(s / e.noise**2)[: e.rows] for s, e in zip(fitted.squares, experiments, strict=True)])
+    return math.sqrt(float(squares.mean())) > config.above_noise
+
+
+def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched]) -> Fitted | None:
+    """Of fits, best first, the one with the fewest parameters that explains what the best one does, but for less than
+    noise and grid could change."""
+
+    def lacks(fitted: Fitted) -> float:
+        squares = zip(fitted.squares, passing[0].squares, experiments, strict=True)
+        return phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments).largest
+
+    return min((f for f in passing if lacks(f) < SIMPLER), key=lambda f: len(f.parameters), default=None)
+
+
+def objections(
+    before: Fitted, after: Fitted, term: Term, experiments: Sequence[Watched], config: RefineConfig
+) -> list[str]:
+    """Why ``term`` is not accepted; empty where it is."""
+    out = []
+    gain = before.bic(after.samples) - after.bic(after.samples)
+    if gain < config.least_bic:
+        out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
+    out += explains_too_little(before, after, experiments, config)
+    sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in term.strengths))
+    if not sigmas >= config.least_sigmas:
+        out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
+    for p in term.parameters:
+        if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper):
+            out.append(f"{p.name} runs into the bound of what is possible, {p.upper:g}")
+    return out
+
+
+def explains_too_little(
+    before: Fitted, after: Fitted, experiments: Sequence[Watched], config: RefineConfig
+) -> list[str]:
+    """What fitted and held-out instants, weighted alike, say against ``after``.
+
+    Three kinds of evidence are enough: more than noise and grid could change, borne out by held-out instants; held-out
+    instants that are decisive on their own; or held-out instants that cannot tell, and a motion that is plain where the
+    simulation is as certain as the observation.
+    """
+    # Variance that it removes, over that which noise and grid would explain.
+    gained = [(b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)]
+    fitted = phases(gained, experiments)
+    share = fitted.largest
+    little = f"it explains {max(share, 0.0):.2g} of what noise and a finer grid alone could change"
+    rest = [k for k, e in enumerate(experiments) if e.holds_out]
+    if not rest:
+        return [] if share >= 1 else [little]
+    won = np.concatenate([gained[k][experiments[k].rows :] for k in rest])
+    old = np.concatenate([(before.squares[k] / experiments[k].sigma ** 2)[experiments[k].rows :] for k in rest])
+    removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
+    confirmed = won.mean() >= SIMPLER and removed >= config.least_gain
+    plain = fitted.certain is not None and fitted.certain >= config.decisive and abs(won.mean()) < 1
+    decisive = won.mean() >= SIMPLER and removed >= config.decisive_gain and share > 0
+    if (confirmed and share >= 1) or plain or decisive:
+        return []
+    held_out = (
+        f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * config.least_gain:.0f} %), "
+        f"{max(float(won.mean()), 0.0):.2g} of what noise and a finer grid alone could change there"
+    )
+    return [little] * (share < 1) + [held_out] * (not confirmed)
