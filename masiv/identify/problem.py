@@ -18,7 +18,7 @@ from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulate import thrown
 from masiv.mpm.simulator import Simulator
-from masiv.scene.scene import Scene
+from masiv.scene.scene import Ground, Scene
 from masiv.scene.transforms import SimulationFrame
 from masiv.twin import TwinEffect
 
@@ -32,8 +32,22 @@ class Motion:
     omega: torch.Tensor
     ground_offset: torch.Tensor
 
+    @classmethod
+    def of_world(
+        cls, axes: SimulationFrame, velocity: np.ndarray, omega: np.ndarray, ground_offset: float = 0.0
+    ) -> Motion:
+        """From velocity (3,) [m/s] and omega (3,) [rad/s] in the world frame."""
+        turned = (torch.as_tensor(axes.vectors_to_simulation(v), dtype=torch.float32) for v in (velocity, omega))
+        return cls(*turned, torch.tensor(ground_offset, dtype=torch.float32))
+
     def tensors(self) -> tuple[torch.Tensor, ...]:
         return self.velocity, self.omega, self.ground_offset
+
+    def ground(self, of_scene: Ground | None) -> Ground | None:
+        """The effective ground."""
+        if of_scene is None:
+            return None
+        return Ground(of_scene.normal, of_scene.height + float(self.ground_offset))
 
 
 class Problem:

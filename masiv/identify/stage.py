@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
@@ -22,7 +21,7 @@ from masiv.identify.start import Start, choose_start
 from masiv.materials.neural import NeuralLaw
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
-from masiv.scene.scene import Ground, Scene
+from masiv.scene.scene import Scene
 from masiv.twin import Twin
 
 
@@ -59,26 +58,19 @@ def _identify(
         trajectory.positions, trajectory.times, scene.gravity, scene.ground, clearance=problem.spacing
     )
     axes = problem.axes
-    motion = Motion(
-        torch.as_tensor(axes.vectors_to_simulation(launch.velocity), dtype=torch.float32),
-        torch.as_tensor(axes.vectors_to_simulation(launch.omega), dtype=torch.float32),
-        torch.zeros(()),
-    )
+    motion = Motion.of_world(axes, launch.velocity, launch.omega)
     first_frames = min(launch.last_frame + 2, problem.frames)
     few = functools.partial(Problem, scene, trajectory, config, simulator, particles=config.search_particles, seed=seed)
     if config.law == "neural":
         found = _neural(problem, few, motion, first_frames, seed, checkpoint, progress)
     else:
         found = identify_classical(problem, few(), motion, first_frames, seed, checkpoint, progress)
-    ground = scene.ground
-    if ground is not None:
-        ground = Ground(ground.normal, ground.height + float(found.motion.ground_offset))
     return Twin(
         positions=np.asarray(trajectory.positions[0], dtype=np.float32),
         velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
         omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
         gravity=np.asarray(scene.gravity, dtype=np.float64),
-        ground=ground,
+        ground=found.motion.ground(scene.ground),
         contact=found.contact,
         friction=0.0,
         volume=trajectory.volume,
@@ -117,22 +109,14 @@ def relearn(
     problem, few = made(), functools.partial(made, particles=config.search_particles, seed=seed)
     axes = problem.axes
     raised = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
-    motion = Motion(
-        torch.as_tensor(axes.vectors_to_simulation(twin.velocity), dtype=torch.float32),
-        torch.as_tensor(axes.vectors_to_simulation(twin.omega), dtype=torch.float32),
-        torch.tensor(raised, dtype=torch.float32),
-    )
+    motion = Motion.of_world(axes, twin.velocity, twin.omega, raised)
     with runtime.torch_threads(1):
-        frames = min((problem.frames + 1) // 2, problem.frames)
-        found = _neural(problem, few, motion, frames, seed, checkpoint or Checkpoint(None), progress)
-    ground = scene.ground
-    if ground is not None:
-        ground = Ground(ground.normal, ground.height + float(found.motion.ground_offset))
+        found = _neural(problem, few, motion, (problem.frames + 1) // 2, seed, checkpoint or Checkpoint(None), progress)
     return replace(
         twin,
         velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
         omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
-        ground=ground,
+        ground=found.motion.ground(scene.ground),
         contact=found.contact,
         law=found.law,
         fit={**twin.fit, **found.report, "trajectory_error_mm": 1e3 * found.error_m, "history": found.history},

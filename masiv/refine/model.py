@@ -14,11 +14,11 @@ from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.identify.families import Family, law_of, motion_of, motion_parameters
 from masiv.identify.parametric import Parameter
 from masiv.identify.problem import Motion, Problem
-from masiv.refine.simulated import Term, effect_parameters, plain_term
+from masiv.refine.simulated import Term, Weighing, effect_parameters, plain_term
 
 
 @dataclass(frozen=True)
-class Experiment:
+class Experiment(Weighing):
     """One throw: rollouts of the body against its observed motion, of which frames 1…fitted-1 may be fitted.
 
     motion: of ``problem``'s start, simulation frame. fine: the same on a finer grid with all particles, of which those
@@ -33,11 +33,6 @@ class Experiment:
     fine: Problem | None
     noise: float
     sigma: np.ndarray
-
-    def weighted(self, field: np.ndarray) -> np.ndarray:
-        """A residual (K, N, 3) [m] from the first instant on, in proportion to what it says: as it is where sigma is
-        the noise, less where the model itself is less certain."""
-        return field * (self.noise / self.sigma[: len(field), None, None])
 
     @property
     def rows(self) -> int:

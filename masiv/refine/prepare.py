@@ -48,11 +48,7 @@ def experiment_of(
     problem.targets[: len(few.targets)] = few.targets
     problem.start = few.start
     launch = estimate_launch(fitted.positions, fitted.times, scene.gravity, scene.ground, clearance=few.spacing)
-    motion = Motion(
-        torch.as_tensor(few.axes.vectors_to_simulation(launch.velocity), dtype=torch.float32),
-        torch.as_tensor(few.axes.vectors_to_simulation(launch.omega), dtype=torch.float32),
-        torch.zeros(()),
-    )
+    motion = Motion.of_world(few.axes, launch.velocity, launch.omega)
     noise = max(noise_floor(fitted.positions, launch.last_frame), LEAST_NOISE)
     seen = torch.cat([problem.start[None], problem.targets]).double().numpy()
     lost = config.tracking_error * beyond_rigid(seen) if scene.cameras else np.zeros(len(problem.targets))

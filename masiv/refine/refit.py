@@ -110,7 +110,7 @@ def chord_fit(
 
     Returns values, residual and the updated Jacobian.
     """
-    values, jacobian = dict(values), jacobian.copy()
+    values = dict(values)
     scale = np.array([p.step for p in params])
     damping = 1e-3
     cost = robust_cost(residual, soft)
@@ -131,8 +131,7 @@ def chord_fit(
         except NonFiniteError:
             damping = max(10 * damping, 0.1)
             continue
-        length = actual / scale
-        jacobian += np.outer(found - residual - jacobian @ actual, length / scale) / (length @ length)
+        jacobian = _updated(jacobian, found - residual, actual, scale)
         gained = cost - robust_cost(found, soft)
         if gained > 0:
             done = gained < LEAST_GAIN * cost
@@ -173,9 +172,13 @@ def leapt(
     if robust_cost(found, soft) >= robust_cost(residual, soft):
         return dict(values), residual, jacobian
     actual = np.array([p.fitted(trial[p.name]) - p.fitted(values[p.name]) for p in params])
-    length = actual / scale
-    update = np.outer(found - residual - jacobian @ actual, length / scale) / max(float(length @ length), 1e-300)
-    return trial, found, jacobian + update
+    return trial, found, _updated(jacobian, found - residual, actual, scale)
+
+
+def _updated(jacobian: np.ndarray, change: np.ndarray, step: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Broyden's update: the ``jacobian`` (M, P) that gives ``change`` (M,) for ``step`` (P,), which is not zero."""
+    length = step / scale
+    return jacobian + np.outer(change - jacobian @ step, length / scale) / (length @ length)
 
 
 def strengths_alone(

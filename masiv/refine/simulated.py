@@ -89,6 +89,37 @@ class Watched(Protocol):
         ...
 
 
+class Weighing:
+    """A part of ``Watched``: residuals in proportion to what they say."""
+
+    noise: float
+    sigma: np.ndarray
+
+    def weighted(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, N, A) [m] from the first instant on: as it is where sigma is the noise, less where the model
+        itself is less certain."""
+        return field * (self.noise / self.sigma[: len(field), None, None])
+
+
+class WholeRun(Weighing):
+    """A part of ``Watched``: a run of which all or no instants are fitted."""
+
+    times: np.ndarray
+    fitted: bool
+
+    @property
+    def instants(self) -> int:
+        return len(self.times)
+
+    @property
+    def rows(self) -> int:
+        return len(self.times) if self.fitted else 0
+
+    @property
+    def holds_out(self) -> bool:
+        return not self.fitted
+
+
 class Simulated(Protocol):
     """Residuals of models over experiments, and the parameters of a model."""
 

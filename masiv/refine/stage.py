@@ -22,7 +22,7 @@ from masiv.refine.observed import Observed, first_frames
 from masiv.refine.prepare import experiment_of
 from masiv.refine.propose import Proposal, propose
 from masiv.refine.refit import Fitted
-from masiv.scene.scene import Ground, Scene
+from masiv.scene.scene import Scene
 from masiv.twin import Twin, TwinEffect
 
 COMPETITORS = {
@@ -118,9 +118,6 @@ def twin_of(fitted: Fitted, throw: Throw, simulation: Simulation, old: Twin) -> 
     axes = experiment.problem.axes
     law = law_of(fitted.model.family, fitted.values)
     law.stderr = {n: fitted.stderr[n] for n in law.values if math.isfinite(fitted.stderr.get(n, math.inf))}
-    ground = throw.scene.ground
-    if ground is not None:
-        ground = Ground(ground.normal, ground.height + float(motion.ground_offset))
     effects = tuple(
         TwinEffect(
             name,
@@ -133,7 +130,7 @@ def twin_of(fitted: Fitted, throw: Throw, simulation: Simulation, old: Twin) -> 
         old,
         velocity=axes.vectors_to_world(motion.velocity.double().numpy()),
         omega=axes.vectors_to_world(motion.omega.double().numpy()),
-        ground=ground,
+        ground=motion.ground(throw.scene.ground),
         contact=fitted.model.contact,
         law=law,
         effects=effects,

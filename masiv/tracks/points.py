@@ -23,7 +23,7 @@ from masiv.kernels.points import point_kernels
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model
 from masiv.refine.refit import Fitted, rms_mm
-from masiv.refine.simulated import Term, plain_term
+from masiv.refine.simulated import Term, WholeRun, plain_term
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import Geometry
 from masiv.tracks.tracks import Body, Run, Tracks
@@ -39,7 +39,7 @@ REFITS = 4
 
 
 @dataclass(frozen=True)
-class PointRun:
+class PointRun(WholeRun):
     """One run of a mass point. observed (K, A) [m, world] along ``axes`` at ``times`` (K,) [s] from the first on; noise
     [m] of it, see ``flight_noise``; sigma (K,): see ``masiv.refine.simulated.Watched``."""
 
@@ -52,22 +52,6 @@ class PointRun:
     outline: Outline
     noise: float
     sigma: np.ndarray
-
-    @property
-    def instants(self) -> int:
-        return len(self.times)
-
-    def weighted(self, field: np.ndarray) -> np.ndarray:
-        """A residual (K, M, A) [m], less where the model itself is less certain."""
-        return field * (self.noise / self.sigma[: len(field), None, None])
-
-    @property
-    def rows(self) -> int:
-        return len(self.times) if self.fitted else 0
-
-    @property
-    def holds_out(self) -> bool:
-        return not self.fitted
 
     @property
     def places(self) -> np.ndarray:

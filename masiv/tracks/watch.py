@@ -28,7 +28,7 @@ from masiv.mpm.rollout import rollout
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model
 from masiv.refine.refit import Fitted, rms_mm
-from masiv.refine.simulated import Term
+from masiv.refine.simulated import Term, WholeRun
 from masiv.tracks.body import Plan, SimulatedBody, plan, simulated_body
 from masiv.tracks.points import outline_of
 from masiv.tracks.tracks import Run, Tracks
@@ -48,7 +48,7 @@ BESIDE = 0.15
 
 
 @dataclass(frozen=True)
-class BodyRun:
+class BodyRun(WholeRun):
     """A run from its release on: observed (K, M, 3) [m, world] of the markers tied to the body at ``times`` (K,) [s
     since the release that the reader found], frames where one is not seen left out. speed [m/s]: their greatest;
     noise [m], sigma (K,): see ``masiv.refine.simulated.Watched``, the noise while the body is held."""
@@ -62,22 +62,6 @@ class BodyRun:
     speed: float
     noise: float
     sigma: np.ndarray
-
-    @property
-    def instants(self) -> int:
-        return len(self.times)
-
-    def weighted(self, field: np.ndarray) -> np.ndarray:
-        """A residual (K, M, A) [m], less where the model itself is less certain."""
-        return field * (self.noise / self.sigma[: len(field), None, None])
-
-    @property
-    def rows(self) -> int:
-        return len(self.times) if self.fitted else 0
-
-    @property
-    def holds_out(self) -> bool:
-        return not self.fitted
 
     @property
     def places(self) -> np.ndarray:
