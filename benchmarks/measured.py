@@ -165,7 +165,7 @@ def damping(
     import torch
     from dissipation import swing
 
-    from masiv.effects.library import effect_named
+    from masiv.effects.catalogue import effect_named
     from masiv.materials.classical import ClassicalLaw
     from masiv.mpm.config import SimulatorConfig
     from masiv.tracks.body import simulated_body, simulated_markers

@@ -14,8 +14,8 @@ import torch
 from unknown_effects import UNKNOWN
 
 from masiv.effects.active import ActiveEffects
+from masiv.effects.catalogue import effect_named
 from masiv.effects.effect import Setting
-from masiv.effects.library import effect_named
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulate import thrown

@@ -24,8 +24,8 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class TwinEffect:
-    """An effect of ``masiv.effects.library`` by name, with ``values`` of all its parameters and their ``stderr`` (None:
-    not known). Vectors and places are in the simulation frame of the twin: +y up, its ``ground`` at y = 0."""
+    """An effect of ``masiv.effects.catalogue`` by name, with ``values`` of all its parameters and their ``stderr``
+    (None: not known). Vectors and places are in the simulation frame of the twin: +y up, its ``ground`` at y = 0."""
 
     name: str
     values: dict[str, float]
@@ -33,7 +33,7 @@ class TwinEffect:
 
     def rows(self) -> list[tuple[str, float, str, float | None]]:
         """(parameter, value, unit, standard error) in the order of the library. Raises InputError."""
-        from masiv.effects.library import effect_named
+        from masiv.effects.catalogue import effect_named
 
         return [
             (p.name, self.values[p.name], p.unit, self.stderr.get(p.name)) for p in effect_named(self.name).parameters
@@ -162,7 +162,7 @@ def _read_effects(entries: Any, path: Path) -> tuple[TwinEffect, ...]:
 
 
 def _read_effect(entry: Any, where: str) -> TwinEffect:
-    from masiv.effects.library import effect_named
+    from masiv.effects.catalogue import effect_named
 
     if not isinstance(entry, dict) or set(entry) != {"effect", "parameters"}:
         raise InputError(f"{where} must have the keys effect and parameters")

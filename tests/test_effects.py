@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from masiv.effects.active import ActiveEffects
+from masiv.effects.catalogue import effects
 from masiv.effects.effect import Setting
-from masiv.effects.library import effects
 from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import rollout

@@ -10,7 +10,7 @@ import torch
 from test_effects import DT, F64, LAW, body, setting, simulator
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.library import effects
+from masiv.effects.catalogue import effects
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulate import thrown

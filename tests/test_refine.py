@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from masiv.effects.active import ActiveEffects
+from masiv.effects.catalogue import effect_named
 from masiv.effects.effect import Setting
-from masiv.effects.library import effect_named
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.parametric import Parameter

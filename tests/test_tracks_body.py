@@ -12,7 +12,7 @@ import torch
 import trimesh
 import yaml
 
-from masiv.effects.library import effects
+from masiv.effects.catalogue import effects
 from masiv.errors import MasivError
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig

@@ -13,7 +13,7 @@ import yaml
 from test_tracks_group import Ball, write_scene
 
 from masiv.cli import main
-from masiv.effects.library import effect_named
+from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig

@@ -16,7 +16,7 @@ from tiny_scenes import springgaus_synthetic
 
 from masiv.cli import main, stages
 from masiv.effects.active import ActiveEffects
-from masiv.effects.library import effect_named
+from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.problem import Motion, Problem

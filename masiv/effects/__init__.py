@@ -1,1 +1,1 @@
-"""Physics that the model may lack, one file an effect. ``masiv.effects.library`` finds them."""
+"""Physics that the model may lack, one file an effect. ``masiv.effects.catalogue`` finds them."""

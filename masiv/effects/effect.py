@@ -52,7 +52,7 @@ class Outline:
 
 
 class Effect(ABC):
-    """One effect; a subclass a file in ``masiv/effects``, found there by ``masiv.effects.library``.
+    """One effect; a subclass a file in ``masiv/effects``, found there by ``masiv.effects.catalogue``.
 
     A subclass sets ``name``, ``looks_like`` (what it does in a video, one line), ``parameters`` (the first ones, as
     many as ``strengths``, are the strength: where they are zero the effect is absent) and overrides one or more hooks.
@@ -83,12 +83,14 @@ class Effect(ABC):
         return None
 
     def node_velocity(self) -> Callable[..., Any]:
-        """Taichi function (x, v, held, t, dt, dx, c) -> v, see ``masiv.kernels.effects.NodeKernels``."""
-        raise NotImplementedError
+        """Taichi function (x, v, held, t, dt, dx, c) -> v, see ``masiv.kernels.effects.NodeKernels``. For those
+        with ``on_grid``."""
+        raise TypeError(f"{self.name} does not act on the grid")
 
     def particle_stress(self) -> Callable[..., Any]:
-        """Taichi function (tau, F, C, c) -> tau, see ``masiv.kernels.effects.StressKernels``."""
-        raise NotImplementedError
+        """Taichi function (tau, F, C, c) -> tau, see ``masiv.kernels.effects.StressKernels``. For those with
+        ``on_stress``."""
+        raise TypeError(f"{self.name} does not act on the stress")
 
     def coefficients(self, theta: torch.Tensor, setting: Setting) -> torch.Tensor:
         """Parameters (P,) -> c, shape (K,) for an effect on the grid, (N, K) for one on the stress; differentiable."""

@@ -9,8 +9,8 @@ import torch
 
 from masiv.continuum.trajectory import Trajectory
 from masiv.effects.active import ActiveEffects
+from masiv.effects.catalogue import effect_named
 from masiv.effects.effect import Setting
-from masiv.effects.library import effect_named
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.law import Law
 from masiv.mpm.config import SimulatorConfig

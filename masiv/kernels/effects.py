@@ -6,7 +6,7 @@ that no two of them add to the same gradient.
 
 import taichi as ti
 
-from masiv.kernels.mpm import DT, DX, NO_GROUND, momentum_of
+from masiv.kernels.grid import DT, DX, NO_GROUND, momentum_of
 
 
 @ti.data_oriented

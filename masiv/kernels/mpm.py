@@ -6,21 +6,14 @@ Forward (Hu et al. 2018, "A moving least squares material point method"):
     grid  v_i = momentum_i / m_i + dt g, then contact with the ground plane y = 0
     g2p   v_p = sum w v_i,  C_p = 4/dx^2 sum w v_i d^T,  x_p += dt v_p,  F_trial = (I + dt C_p) F
 
-The adjoint of P2G is a gather and the adjoint of G2P a scatter, so both directions share two loop shapes. On a CPU each
-chunk of particles scatters into a grid of its own (a float atomic is a compare-and-swap loop there, and its order is
-not reproducible); on a GPU all particles scatter atomically into one grid.
-
-The grid is a window that follows the particles: node (i, j, k) of the lattice dx Z^3 lives at a flat index relative to
-``window_origin``, so the domain is unbounded and memory is that of the object. State fields are allocated by capacity,
-and live counts are kernel arguments: a field's shape is part of a compiled kernel.
+The adjoint of P2G is a gather and the adjoint of G2P a scatter, so both directions share two loop shapes. The grid is
+in ``masiv.kernels.grid``. State fields are allocated by capacity, and live counts are kernel arguments: a field's shape
+is part of a compiled kernel.
 """
 
 import taichi as ti
 
-STICKY, RELEASE, SLIP, NO_GROUND = 0, 1, 2, 3
-
-# Entries of ``constants``.
-DT, DX, VOLUME, GRAVITY_X, GRAVITY_Y, GRAVITY_Z, FRICTION, CONSTANT_COUNT = range(8)
+from masiv.kernels.grid import DT, DX, VOLUME, GridKernels, momentum_of
 
 NO_FAULT = (1 << 62) - 1
 
@@ -31,32 +24,24 @@ def column(a, c: ti.template()):
 
 
 @ti.func
-def momentum_of(value):
-    """The first three of four."""
-    return ti.Vector([value[0], value[1], value[2]])
-
-
-@ti.func
 def by_columns(a, b, c):
     """The matrix of three columns, of which the first three entries count."""
     return ti.Matrix([[a[0], b[0], c[0]], [a[1], b[1], c[1]], [a[2], b[2], c[2]]])
 
 
 @ti.data_oriented
-class MpmKernels:
+class MpmKernels(GridKernels):
     """Memory and kernels. Positions in the simulation frame (y up, ground at y = 0), SI units.
 
     capacity_steps: substeps whose state is kept at once; capacity_particles, capacity_nodes: upper bounds.
     """
 
     def __init__(self, real, capacity_steps: int, capacity_particles: int, capacity_nodes: int, chunks: int, gpu: bool):
-        self.real = real
+        capacity_log = capacity_nodes + capacity_steps * max(4096, capacity_particles)
+        super().__init__(real, capacity_nodes, capacity_log, chunks, gpu)
         self.capacity_steps = capacity_steps
         self.capacity_particles = capacity_particles
-        self.capacity_nodes = capacity_nodes
         self.owner = None  # whose states the fields hold
-        self.gpu = gpu
-        self.chunks = 1 if gpu else chunks
         stored = (capacity_steps + 1, capacity_particles)
         self.position = ti.Vector.field(3, real, shape=stored)
         self.velocity = ti.Vector.field(3, real, shape=stored)
@@ -72,62 +57,9 @@ class MpmKernels:
         self.stress_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
         self.particle_mass = ti.field(real, shape=capacity_particles)
         self.mass_bar = ti.field(real, shape=capacity_particles)
-        self.private = ti.Vector.field(4, real, shape=(self.chunks, capacity_nodes))
-        # (momentum, mass) of the nodes: scratch, then a log from which the adjoint takes the grids of past substeps.
-        self.capacity_log = capacity_nodes + capacity_steps * max(4096, capacity_particles)
-        self.grid_momentum = ti.Vector.field(4, real, shape=self.capacity_log)
-        self.grid_velocity = ti.Vector.field(4, real, shape=capacity_nodes)  # the fourth pads: one aligned load
-        self.grid_velocity_bar = ti.Vector.field(3, real, shape=capacity_nodes)
-        self.grid_momentum_bar = ti.Vector.field(4, real, shape=capacity_nodes)
-        self.constants = ti.field(real, shape=CONSTANT_COUNT)
-        self.contact = ti.field(ti.i32, shape=())
-        self.window_origin = ti.Vector.field(3, ti.i32, shape=())
-        self.window_shape = ti.Vector.field(3, ti.i32, shape=())
         self.fault = ti.field(ti.i64, shape=2)  # first (substep << 32 | particle) that broke CFL; that left the window
 
-    # ---- helpers -------------------------------------------------------------------------------------------------
-
-    @ti.func
-    def weights(self, fx):
-        """Rows: the three nodes; columns: axes. Quadratic B-spline."""
-        w = ti.Matrix.zero(self.real, 3, 3)
-        for a in ti.static(range(3)):
-            w[0, a] = 0.5 * (1.5 - fx[a]) * (1.5 - fx[a])
-            w[1, a] = 0.75 - (fx[a] - 1.0) * (fx[a] - 1.0)
-            w[2, a] = 0.5 * (fx[a] - 0.5) * (fx[a] - 0.5)
-        return w
-
-    @ti.func
-    def weight_slopes(self, fx):
-        """Derivative of ``weights`` with respect to fx."""
-        g = ti.Matrix.zero(self.real, 3, 3)
-        for a in ti.static(range(3)):
-            g[0, a] = fx[a] - 1.5
-            g[1, a] = -2.0 * (fx[a] - 1.0)
-            g[2, a] = fx[a] - 0.5
-        return g
-
-    @ti.func
-    def add(self, t: ti.i32, node: ti.i32, value):
-        if ti.static(self.gpu):
-            self.private[t, node] += value
-        else:
-            self.private[t, node] = self.private[t, node] + value
-
-    @ti.func
-    def stencil(self, x, dx):
-        """Base node relative to the window, offset of the particle from it in cells, and whether the stencil fits."""
-        scaled = x / dx
-        base = ti.floor(scaled - 0.5, ti.i32)
-        fx = scaled - base
-        local = base - self.window_origin[None]
-        fits = True
-        for a in ti.static(range(3)):
-            if local[a] < 0 or local[a] + 2 >= self.window_shape[None][a]:
-                fits = False
-        return local, fx, fits
-
-    # ---- forward -------------------------------------------------------------------------------------------------
+    # ---- forward -----------------------------------------------------------------------------------------------------
 
     @ti.func
     def p2g_particle(self, t: ti.i32, s: ti.i32, p: ti.i32):
@@ -168,90 +100,6 @@ class MpmKernels:
                     self.private[t, n] = ti.Vector.zero(self.real, 4)
                 for p in range(t * count // self.chunks, (t + 1) * count // self.chunks):
                     self.p2g_particle(t, s, p)
-
-    @ti.func
-    def node_height(self, row: ti.i32):
-        """Lattice index along y of a row of nodes (all k of one i, j); the ground plane is at 0."""
-        return self.window_origin[None][1] + row % self.window_shape[None][1]
-
-    @ti.func
-    def rows(self):
-        return self.window_shape[None][0] * self.window_shape[None][1]
-
-    @ti.func
-    def gravity(self):
-        return ti.Vector([self.constants[GRAVITY_X], self.constants[GRAVITY_Y], self.constants[GRAVITY_Z]])
-
-    @ti.func
-    def sum_of_chunks(self, n: ti.i32):
-        value = self.private[0, n]
-        for t in ti.static(range(1, self.chunks)):
-            value += self.private[t, n]
-        return value
-
-    @ti.func
-    def row_velocities(self, row: ti.i32, offset: ti.i32):
-        """Velocity after gravity and contact of a row's nodes, from their momenta in the log at ``offset``."""
-        nz = self.window_shape[None][2]
-        kick = self.constants[DT] * self.gravity()
-        grounded = self.contact[None] != NO_GROUND and self.node_height(row) <= 0
-        for n in range(row * nz, (row + 1) * nz):
-            value = self.grid_momentum[offset + n]
-            v = ti.Vector.zero(self.real, 3)
-            if value[3] > 0.0:
-                v = momentum_of(value) / value[3] + kick
-                if grounded:
-                    v = self.contact_velocity(v)
-            self.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
-
-    @ti.func
-    def row_update(self, row: ti.i32, offset: ti.i32):
-        nz = self.window_shape[None][2]
-        for n in range(row * nz, (row + 1) * nz):
-            self.grid_momentum[offset + n] = self.sum_of_chunks(n)
-        self.row_velocities(row, offset)
-
-    @ti.kernel
-    def grid_update(self, offset: ti.i32):
-        """Sum the chunks' grids into the log at ``offset``, and the velocities that follow."""
-        if ti.static(self.gpu):
-            for row in range(self.rows()):
-                self.row_update(row, offset)
-        else:
-            ti.loop_config(block_dim=1)
-            for t in range(self.chunks):
-                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
-                    self.row_update(row, offset)
-
-    @ti.kernel
-    def grid_velocities(self, offset: ti.i32):
-        """``grid_update`` from a logged grid."""
-        if ti.static(self.gpu):
-            for row in range(self.rows()):
-                self.row_velocities(row, offset)
-        else:
-            ti.loop_config(block_dim=1)
-            for t in range(self.chunks):
-                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
-                    self.row_velocities(row, offset)
-
-    @ti.func
-    def contact_velocity(self, v):
-        """Velocity of a node on or below the ground after contact. Friction is Coulomb's, for ``SLIP``."""
-        out = v
-        if self.contact[None] == STICKY:
-            out = ti.Vector.zero(self.real, 3)
-        elif v[1] < 0.0:
-            if self.contact[None] == RELEASE:
-                out = ti.Vector.zero(self.real, 3)
-            else:
-                tangent = ti.Vector([v[0], 0.0, v[2]])
-                speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
-                kept = ti.cast(0.0, self.real)
-                if speed > -self.constants[FRICTION] * v[1]:
-                    kept = 1.0 + self.constants[FRICTION] * v[1] / speed
-                out = kept * tangent
-        return out
 
     @ti.func
     def g2p_particle(self, s: ti.i32, p: ti.i32):
@@ -321,11 +169,6 @@ class MpmKernels:
         """(too fast, outside of the window): each substep << 32 | particle, or -1."""
         return tuple(-1 if self.fault[i] == NO_FAULT else self.fault[i] for i in range(2))
 
-    @ti.kernel
-    def set_window(self, ox: ti.i32, oy: ti.i32, oz: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
-        self.window_origin[None] = ti.Vector([ox, oy, oz])
-        self.window_shape[None] = ti.Vector([nx, ny, nz])
-
     # ---- adjoint -------------------------------------------------------------------------------------------------
     # ``*_bar`` hold the adjoint of the state after substep s; each kernel replaces them by that before it.
 
@@ -377,51 +220,6 @@ class MpmKernels:
                     self.g2p_adjoint_particle(t, s, p)
 
     @ti.func
-    def row_adjoint(self, row: ti.i32, offset: ti.i32):
-        nz = self.window_shape[None][2]
-        kick = self.constants[DT] * self.gravity()
-        grounded = self.contact[None] != NO_GROUND and self.node_height(row) <= 0
-        for n in range(row * nz, (row + 1) * nz):
-            out = ti.Vector.zero(self.real, 4)
-            value = self.grid_momentum[offset + n]
-            if value[3] > 0.0:
-                bar = momentum_of(self.sum_of_chunks(n))
-                momentum = momentum_of(value)
-                if grounded:
-                    bar = self.contact_adjoint(momentum / value[3] + kick, bar)
-                out = ti.Vector([bar[0], bar[1], bar[2], -bar.dot(momentum) / value[3]]) / value[3]
-            self.grid_momentum_bar[n] = out
-
-    @ti.kernel
-    def grid_adjoint(self, offset: ti.i32):
-        if ti.static(self.gpu):
-            for row in range(self.rows()):
-                self.row_adjoint(row, offset)
-        else:
-            ti.loop_config(block_dim=1)
-            for t in range(self.chunks):
-                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
-                    self.row_adjoint(row, offset)
-
-    @ti.func
-    def contact_adjoint(self, v, bar):
-        """Adjoint of ``contact_velocity`` at v."""
-        out = bar
-        if self.contact[None] == STICKY:
-            out = ti.Vector.zero(self.real, 3)
-        elif v[1] < 0.0:
-            out = ti.Vector.zero(self.real, 3)
-            if self.contact[None] == SLIP:
-                mu = self.constants[FRICTION]
-                speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
-                if speed > -mu * v[1]:
-                    along = (bar[0] * v[0] + bar[2] * v[2]) / speed
-                    kept = 1.0 + mu * v[1] / speed
-                    turn = -mu * v[1] * along / (speed * speed)
-                    out = ti.Vector([kept * bar[0] + turn * v[0], mu * along, kept * bar[2] + turn * v[2]])
-        return out
-
-    @ti.func
     def p2g_adjoint_particle(self, s: ti.i32, p: ti.i32):
         dx, dt, mass = self.constants[DX], self.constants[DT], self.particle_mass[p]
         local, fx, _ = self.stencil(self.position[s, p], dx)
@@ -469,7 +267,7 @@ class MpmKernels:
         for p in range(count):
             self.p2g_adjoint_particle(s, p)
 
-    # ---- to and from torch ---------------------------------------------------------------------------------------
+    # ---- to and from torch -------------------------------------------------------------------------------------------
 
     @ti.kernel
     def write_state(

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
+from masiv.effects.catalogue import effect_named
 from masiv.effects.effect import Setting
-from masiv.effects.library import effect_named
 from masiv.scene.transforms import SimulationFrame
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.library import causes, effect_named
+from masiv.effects.catalogue import causes, effect_named
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.identify.families import Family, law_of, motion_of, motion_parameters
 from masiv.identify.parametric import Parameter

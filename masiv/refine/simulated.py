@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from masiv.effects.library import effect_named
+from masiv.effects.catalogue import effect_named
 from masiv.identify.parametric import Parameter
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
-from masiv.effects.library import effect_named
+from masiv.effects.catalogue import effect_named
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.families import law_of
 from masiv.mpm.config import SimulatorConfig

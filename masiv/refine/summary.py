@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from masiv.effects.library import effect_named
+from masiv.effects.catalogue import effect_named
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess
 from masiv.refine.loop import STOP_GAP, Round

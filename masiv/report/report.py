@@ -160,7 +160,7 @@ def _twin_rows(twin: Twin) -> list[list[Any]]:
 
 def _effects_section(page: Page, twin: Twin) -> None:
     """What acts on the twin besides its law, gravity and ground."""
-    from masiv.effects.library import effect_named
+    from masiv.effects.catalogue import effect_named
 
     if not twin.effects:
         return

@@ -78,8 +78,8 @@ def _effects(spec: SynthSpec, rest, volume: float) -> ActiveEffects:
     import torch
 
     from masiv.effects.active import ActiveEffects
+    from masiv.effects.catalogue import effect_named
     from masiv.effects.effect import Setting
-    from masiv.effects.library import effect_named
 
     members = []
     for name, given in spec.effects.items():

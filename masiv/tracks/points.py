@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.effect import Effect, EffectParameter, Outline, Setting
-from masiv.effects.library import causes, effect_named
 from masiv.errors import InputError, NonFiniteError
 from masiv.identify.families import Family
 from masiv.identify.parametric import Parameter

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from masiv.effects.library import effect_named
+from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.materials.classical import UNITS
 from masiv.refine.refit import Fitted

@@ -18,8 +18,8 @@ import torch
 from scipy.interpolate import CubicSpline
 
 from masiv.effects.active import ActiveEffects
+from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.effect import EffectParameter, Outline, Setting
-from masiv.effects.library import causes, effect_named
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.identify.parametric import Parameter
 from masiv.materials.classical import ClassicalLaw

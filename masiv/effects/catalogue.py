@@ -10,7 +10,7 @@ import masiv.effects
 from masiv.effects.effect import Effect
 from masiv.errors import InputError
 
-_NOT_EFFECTS = {"effect", "library", "active"}
+_NOT_EFFECTS = {"effect", "catalogue", "active"}
 
 
 def causes() -> dict[str, Effect]:

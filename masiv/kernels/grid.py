@@ -1,0 +1,218 @@
+"""The grid of MLS-MPM: a window that follows the particles, its velocities after gravity and contact; their adjoint.
+
+Node (i, j, k) of the lattice dx Z^3 lives at a flat index relative to ``window_origin``, so the domain is unbounded and
+memory is that of the object. On a CPU each chunk of particles scatters into a grid of its own (a float atomic is a
+compare-and-swap loop there, and its order is not reproducible); on a GPU all particles scatter into one, atomically.
+"""
+
+import taichi as ti
+
+STICKY, RELEASE, SLIP, NO_GROUND = 0, 1, 2, 3
+
+# Entries of ``constants``.
+DT, DX, VOLUME, GRAVITY_X, GRAVITY_Y, GRAVITY_Z, FRICTION, CONSTANT_COUNT = range(8)
+
+
+@ti.func
+def momentum_of(value):
+    """The first three of four."""
+    return ti.Vector([value[0], value[1], value[2]])
+
+
+@ti.data_oriented
+class GridKernels:
+    """Memory and kernels of the nodes. Simulation frame (y up, ground at y = 0), SI units.
+
+    capacity_nodes: upper bound; capacity_log: entries of the log of past substeps' nodes.
+    """
+
+    def __init__(self, real, capacity_nodes: int, capacity_log: int, chunks: int, gpu: bool):
+        self.real = real
+        self.capacity_nodes = capacity_nodes
+        self.capacity_log = capacity_log
+        self.gpu = gpu
+        self.chunks = 1 if gpu else chunks
+        self.private = ti.Vector.field(4, real, shape=(self.chunks, capacity_nodes))
+        # (momentum, mass) of the nodes: scratch, then a log from which the adjoint takes the grids of past substeps.
+        self.grid_momentum = ti.Vector.field(4, real, shape=capacity_log)
+        self.grid_velocity = ti.Vector.field(4, real, shape=capacity_nodes)  # the fourth pads: one aligned load
+        self.grid_velocity_bar = ti.Vector.field(3, real, shape=capacity_nodes)
+        self.grid_momentum_bar = ti.Vector.field(4, real, shape=capacity_nodes)
+        self.constants = ti.field(real, shape=CONSTANT_COUNT)
+        self.contact = ti.field(ti.i32, shape=())
+        self.window_origin = ti.Vector.field(3, ti.i32, shape=())
+        self.window_shape = ti.Vector.field(3, ti.i32, shape=())
+
+    @ti.func
+    def weights(self, fx):
+        """Rows: the three nodes; columns: axes. Quadratic B-spline."""
+        w = ti.Matrix.zero(self.real, 3, 3)
+        for a in ti.static(range(3)):
+            w[0, a] = 0.5 * (1.5 - fx[a]) * (1.5 - fx[a])
+            w[1, a] = 0.75 - (fx[a] - 1.0) * (fx[a] - 1.0)
+            w[2, a] = 0.5 * (fx[a] - 0.5) * (fx[a] - 0.5)
+        return w
+
+    @ti.func
+    def weight_slopes(self, fx):
+        """Derivative of ``weights`` with respect to fx."""
+        g = ti.Matrix.zero(self.real, 3, 3)
+        for a in ti.static(range(3)):
+            g[0, a] = fx[a] - 1.5
+            g[1, a] = -2.0 * (fx[a] - 1.0)
+            g[2, a] = fx[a] - 0.5
+        return g
+
+    @ti.func
+    def stencil(self, x, dx):
+        """Base node relative to the window, offset of the particle from it in cells, and whether the stencil fits."""
+        scaled = x / dx
+        base = ti.floor(scaled - 0.5, ti.i32)
+        fx = scaled - base
+        local = base - self.window_origin[None]
+        fits = True
+        for a in ti.static(range(3)):
+            if local[a] < 0 or local[a] + 2 >= self.window_shape[None][a]:
+                fits = False
+        return local, fx, fits
+
+    @ti.func
+    def add(self, t: ti.i32, node: ti.i32, value):
+        if ti.static(self.gpu):
+            self.private[t, node] += value
+        else:
+            self.private[t, node] = self.private[t, node] + value
+
+    @ti.kernel
+    def set_window(self, ox: ti.i32, oy: ti.i32, oz: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
+        self.window_origin[None] = ti.Vector([ox, oy, oz])
+        self.window_shape[None] = ti.Vector([nx, ny, nz])
+
+    @ti.func
+    def node_height(self, row: ti.i32):
+        """Lattice index along y of a row of nodes (all k of one i, j); the ground plane is at 0."""
+        return self.window_origin[None][1] + row % self.window_shape[None][1]
+
+    @ti.func
+    def rows(self):
+        return self.window_shape[None][0] * self.window_shape[None][1]
+
+    @ti.func
+    def gravity(self):
+        return ti.Vector([self.constants[GRAVITY_X], self.constants[GRAVITY_Y], self.constants[GRAVITY_Z]])
+
+    @ti.func
+    def sum_of_chunks(self, n: ti.i32):
+        value = self.private[0, n]
+        for t in ti.static(range(1, self.chunks)):
+            value += self.private[t, n]
+        return value
+
+    @ti.func
+    def row_velocities(self, row: ti.i32, offset: ti.i32):
+        """Velocity after gravity and contact of a row's nodes, from their momenta in the log at ``offset``."""
+        nz = self.window_shape[None][2]
+        kick = self.constants[DT] * self.gravity()
+        grounded = self.contact[None] != NO_GROUND and self.node_height(row) <= 0
+        for n in range(row * nz, (row + 1) * nz):
+            value = self.grid_momentum[offset + n]
+            v = ti.Vector.zero(self.real, 3)
+            if value[3] > 0.0:
+                v = momentum_of(value) / value[3] + kick
+                if grounded:
+                    v = self.contact_velocity(v)
+            self.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
+
+    @ti.func
+    def row_update(self, row: ti.i32, offset: ti.i32):
+        nz = self.window_shape[None][2]
+        for n in range(row * nz, (row + 1) * nz):
+            self.grid_momentum[offset + n] = self.sum_of_chunks(n)
+        self.row_velocities(row, offset)
+
+    @ti.kernel
+    def grid_update(self, offset: ti.i32):
+        """Sum the chunks' grids into the log at ``offset``, and the velocities that follow."""
+        if ti.static(self.gpu):
+            for row in range(self.rows()):
+                self.row_update(row, offset)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.chunks):
+                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
+                    self.row_update(row, offset)
+
+    @ti.kernel
+    def grid_velocities(self, offset: ti.i32):
+        """``grid_update`` from a logged grid."""
+        if ti.static(self.gpu):
+            for row in range(self.rows()):
+                self.row_velocities(row, offset)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.chunks):
+                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
+                    self.row_velocities(row, offset)
+
+    @ti.func
+    def contact_velocity(self, v):
+        """Velocity of a node on or below the ground after contact. Friction is Coulomb's, for ``SLIP``."""
+        out = v
+        if self.contact[None] == STICKY:
+            out = ti.Vector.zero(self.real, 3)
+        elif v[1] < 0.0:
+            if self.contact[None] == RELEASE:
+                out = ti.Vector.zero(self.real, 3)
+            else:
+                tangent = ti.Vector([v[0], 0.0, v[2]])
+                speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
+                kept = ti.cast(0.0, self.real)
+                if speed > -self.constants[FRICTION] * v[1]:
+                    kept = 1.0 + self.constants[FRICTION] * v[1] / speed
+                out = kept * tangent
+        return out
+
+    @ti.func
+    def row_adjoint(self, row: ti.i32, offset: ti.i32):
+        nz = self.window_shape[None][2]
+        kick = self.constants[DT] * self.gravity()
+        grounded = self.contact[None] != NO_GROUND and self.node_height(row) <= 0
+        for n in range(row * nz, (row + 1) * nz):
+            out = ti.Vector.zero(self.real, 4)
+            value = self.grid_momentum[offset + n]
+            if value[3] > 0.0:
+                bar = momentum_of(self.sum_of_chunks(n))
+                momentum = momentum_of(value)
+                if grounded:
+                    bar = self.contact_adjoint(momentum / value[3] + kick, bar)
+                out = ti.Vector([bar[0], bar[1], bar[2], -bar.dot(momentum) / value[3]]) / value[3]
+            self.grid_momentum_bar[n] = out
+
+    @ti.kernel
+    def grid_adjoint(self, offset: ti.i32):
+        if ti.static(self.gpu):
+            for row in range(self.rows()):
+                self.row_adjoint(row, offset)
+        else:
+            ti.loop_config(block_dim=1)
+            for t in range(self.chunks):
+                for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
+                    self.row_adjoint(row, offset)
+
+    @ti.func
+    def contact_adjoint(self, v, bar):
+        """Adjoint of ``contact_velocity`` at v."""
+        out = bar
+        if self.contact[None] == STICKY:
+            out = ti.Vector.zero(self.real, 3)
+        elif v[1] < 0.0:
+            out = ti.Vector.zero(self.real, 3)
+            if self.contact[None] == SLIP:
+                mu = self.constants[FRICTION]
+                speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
+                if speed > -mu * v[1]:
+                    along = (bar[0] * v[0] + bar[2] * v[2]) / speed
+                    kept = 1.0 + mu * v[1] / speed
+                    turn = -mu * v[1] * along / (speed * speed)
+                    out = ti.Vector([kept * bar[0] + turn * v[0], mu * along, kept * bar[2] + turn * v[2]])
+        return out
