@@ -74,6 +74,7 @@ def cases():
 
 def refined(case, particles, laws):
     import torch
+    from oracle import oracle
     from track_cases import observed
 
     from masiv.checkpoint import Checkpoint
@@ -103,6 +104,8 @@ def refined(case, particles, laws):
     middle = time.time()
     outcome = close_loop(simulation, fits, config, quiet)
     first = outcome.rounds[0] if outcome.rounds else None
+    known = {"law": case.law, "contact": case.contact, "parameters": case.parameters, "effects": case.effects}
+    told = {} if case.outside else oracle(simulation, outcome, **known)
     return {
         "case": case.name,
         "true": {**case.effects, **case.outside},
@@ -124,34 +127,13 @@ def refined(case, particles, laws):
         "confusable": first.confusable if first else {},
         "before": [outcome.before.fit_mm, outcome.before.held_out_mm],
         "after": [outcome.after.fit_mm, outcome.after.held_out_mm],
-        "oracle": None if case.outside else oracle(simulation, case, outcome),
+        "oracle": None if case.outside else [told.get("problem") or told["fit_mm"], told.get("held_out_mm")],
         "seconds": [middle - began, time.time() - middle],
     }  # fmt: skip
 
 
 def quiet(*_):
     """No progress."""
-
-
-def oracle(simulation, case, outcome):
-    """Errors [mm] of a model of the true law that was told the true effects, values too, and fitted for the rest: the
-    better of the fits that begin at refine's model without effects and at its last."""
-    from masiv.errors import MasivError
-    from masiv.identify.families import FAMILIES
-    from masiv.refine.model import Model, effect_parameters
-    from masiv.refine.refit import full_fit
-
-    model = Model(FAMILIES[case.law], case.contact, tuple(case.effects))
-    told = {p.name: case.effects[n][p.name.split(".")[1]] for n in case.effects for p in effect_parameters(n)}
-    fits = []
-    for start in (outcome.before, outcome.after):
-        own = {n: v for n, v in start.values.items() if "@" in n}
-        try:
-            fits.append(full_fit(simulation, model, {**own, **case.parameters, **told}, budget=24))
-        except MasivError as failed:
-            problem = str(failed)
-    best = min(fits, key=lambda f: f.fit_mm, default=None)
-    return problem if best is None else [best.fit_mm, best.held_out_mm]
 
 
 def table(path):

@@ -95,9 +95,9 @@ def fits(*levels, count=3):
     return SimpleNamespace(squares=[squares], parameters=[None] * count)
 
 
-def judged(before, after, sigma=NOISE):
+def judged(before, after, sigma=NOISE, adapts=True):
     experiments = [Watched(sigma=np.full(INSTANTS, sigma))]
-    return explains_too_little(before, after, experiments, RefineConfig.model_validate({}))
+    return explains_too_little(before, after, experiments, RefineConfig.model_validate({}), adapts=adapts)
 
 
 def test_evidence():
@@ -107,6 +107,11 @@ def test_evidence():
     assert judged(fits(9, 20), fits(2, 20)) == []  # they cannot tell, the fitted ones are plain
     assert "held-out" in judged(fits(9, 20), fits(6, 20))[0]  # not plain enough for that
     assert judged(fits(2, 20), fits(1.5, 3)) == []  # they are decisive
+    # What has a strength and nothing else may explain less, but not against what is held out.
+    little = fits(1.6, 2.0), fits(1.2, 1.2)
+    assert "of what noise" in judged(*little)[0]
+    assert judged(*little, adapts=False) == []
+    assert "held-out" in judged(fits(1.6, 2.0), fits(1.2, 2.0), adapts=False)[-1]
     # Nothing is plain where the simulation is nowhere as certain as the observation.
     assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]
 

@@ -74,7 +74,8 @@ def objections(
     gain = before.bic(after.samples) - after.bic(after.samples)
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
-    out += explains_too_little(before, after, experiments, config)
+    adapts = bool(term.others) or gain < 2 * config.least_bic
+    out += explains_too_little(before, after, experiments, config, adapts=adapts)
     sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in term.strengths))
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
@@ -85,13 +86,14 @@ def objections(
 
 
 def explains_too_little(
-    before: Fitted, after: Fitted, experiments: Sequence[Watched], config: RefineConfig
+    before: Fitted, after: Fitted, experiments: Sequence[Watched], config: RefineConfig, *, adapts: bool = True
 ) -> list[str]:
     """What fitted and held-out instants, weighted alike, say against ``after``.
 
-    Three kinds of evidence are enough: more than noise and grid could change, borne out by held-out instants; held-out
-    instants that are decisive on their own; or held-out instants that cannot tell, and a motion that is plain where the
-    simulation is as certain as the observation.
+    Four kinds of evidence are enough: more than noise and grid could change, borne out by held-out instants; held-out
+    instants that are decisive on their own; held-out instants that cannot tell, and a motion that is plain where the
+    simulation is as certain as the observation; or a good part of the held-out error, for an effect that cannot adapt
+    to an error of any shape (``adapts`` False: it has no place and no frequency, and the criterion is clear).
     """
     # Variance that it removes, over that which noise and grid would explain.
     gained = [(b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)]
@@ -107,7 +109,8 @@ def explains_too_little(
     confirmed = won.mean() >= SIMPLER and removed >= config.least_gain
     plain = fitted.certain is not None and fitted.certain >= config.decisive and abs(won.mean()) < 1
     decisive = won.mean() >= SIMPLER and removed >= config.decisive_gain and share > 0
-    if (confirmed and share >= 1) or plain or decisive:
+    simple = confirmed and not adapts and removed >= config.simple_gain and share > 0
+    if (confirmed and share >= 1) or plain or decisive or simple:
         return []
     held_out = (
         f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * config.least_gain:.0f} %), "

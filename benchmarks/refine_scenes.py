@@ -1,0 +1,121 @@
+"""What does refine name in filmed scenes, and how near does it come to a model that was told?
+
+    python benchmarks/refine_scenes.py RUN SCENE/truth.yaml --out FILE.jsonl [--second-run RUN2]
+    python benchmarks/refine_scenes.py --table FILE.jsonl
+
+RUN: what ``masiv identify SCENE --fit-frames N`` left. One JSON line a run; the run itself is not changed.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import yaml
+
+FAMILIES = {"elastic": "neo_hookean", "plasticine": "von_mises", "newtonian": "newtonian",
+            "non_newtonian": "non_newtonian", "sand": "drucker_prager"}  # fmt: skip
+PARAMETERS = {"E": "youngs_modulus", "nu": "poissons_ratio", "yield_stress": "yield_stress"}
+
+
+def true_effects(truth):
+    """The undeclared effect of a scene as effects of the library, with values."""
+    effect = truth.get("effect") or {"name": "none"}
+    match effect["name"]:
+        case "none":
+            return {}
+        case "drag":
+            return {"linear_drag": {"rate": effect["linear"]}, "quadratic_drag": {"coefficient": effect["quadratic"]}}
+        case "wind":
+            return {"body_force": {f"acceleration_{axis}": effect["acc"][k] for k, axis in enumerate("xyz")}}
+        case "kelvin_voigt":
+            return {"viscosity": {"viscosity": effect["eta"]}}
+    raise SystemExit(f"no effect of the library is like '{effect['name']}'")
+
+
+def measured(run, truth_file, second, given):
+    from oracle import oracle
+
+    from masiv.cli import refining, stages
+    from masiv.config import RefineConfig
+    from masiv.refine.stage import refine
+    from masiv.refine.summary import summary
+
+    truth = yaml.safe_load(truth_file.read_text())
+    throws, began = [], time.time()
+    for path in [run, *second]:
+        folder, settings, scene = stages.reopen_run(path, preset=None, config=None, seed=None, arch=None)
+        if not throws:
+            stages.start(settings)
+            first = settings
+        throws.append(refining.throw_of(path, folder, settings, scene, quiet))
+    twin = refining.load_twin(run)
+    config = RefineConfig.model_validate({**first.refine.model_dump(), **given})
+    start = twin.fit.get("start") or twin.fit.get("law")
+    loaded = time.time()
+    found = refine(throws, first.identify, first.simulator, config, start=start, seed=first.seed, progress=quiet)
+    done = time.time()
+    document = summary(found, config, dry_run=False)
+    effects = true_effects(truth)
+    told = None
+    law = FAMILIES[truth["material"]["type"]]
+    known = {PARAMETERS[k]: float(v) for k, v in truth["material"].items() if k in PARAMETERS}
+    if effects:
+        contact = found.outcome.after.model.contact
+        told = oracle(found.simulation, found.outcome, law=law, contact=contact, parameters=known, effects=effects)
+    keep = ("verdict", "candidates", "accepted", "before", "after", "residual_over_floor", "rounds", "laws")
+    return {
+        "run": run.name,
+        "second": [p.name for p in second],
+        "true": effects,
+        "document": {k: document[k] for k in keep if k in document},
+        "oracle": told,
+        "rollouts": found.simulation.rollouts,
+        "seconds": [loaded - began, done - loaded],
+    }
+
+
+def quiet(*_):
+    """No progress."""
+
+
+def table(path):
+    print("| scene | true | ranked first | accepted | before, fitted / held out [mm] | after | oracle | s |")
+    print("|---|---|---|---|---|---|---|---|")
+    for line in Path(path).read_text().splitlines():
+        r = json.loads(line)
+        d, told = r["document"], r["oracle"]
+        ranked = ", ".join(f"{c['effect']} {100 * c['explained']:.0f} %" for c in d["candidates"][:2])
+        values = "; ".join(
+            f"{a['effect']} " + ", ".join(f"{v:.3g} ± {a['stderr'][n]:.2g}" for n, v in a["theta"].items())
+            for a in d["accepted"]
+        )
+        pair = "{:.1f} / {:.1f}".format
+        shown = " + ".join([r["run"], *r["second"]])
+        oracle = "–" if not told else told.get("problem") or pair(told["fit_mm"], told["held_out_mm"])
+        before, after = ([d[k][part]["rmse_mm"] for part in ("fit", "held_out")] for k in ("before", "after"))
+        cells = (shown, ", ".join(r["true"]) or "none", ranked, values or d["verdict"], pair(*before), pair(*after),
+                 oracle, f"{sum(r['seconds']):.0f}")  # fmt: skip
+        print(f"| {' | '.join(cells)} |")
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("run", nargs="?", type=Path)
+    parser.add_argument("truth", nargs="?", type=Path)
+    parser.add_argument("--out", default="refine_scenes.jsonl")
+    parser.add_argument("--second-run", action="append", default=[], type=Path)
+    parser.add_argument("--refine", default="{}", help="keys of the section refine of the configuration, as JSON")
+    parser.add_argument("--table")
+    options = parser.parse_args()
+    if options.table:
+        table(options.table)
+        return
+    row = measured(options.run, options.truth, options.second_run, json.loads(options.refine))
+    with Path(options.out).open("a") as file:
+        file.write(json.dumps(row) + "\n")
+    table(options.out)
+
+
+if __name__ == "__main__":
+    main()
