@@ -20,7 +20,8 @@ def oracle(simulation, outcome, *, law: str, contact: str, parameters: Mapping[s
     model = Model(FAMILIES[law], contact, tuple(effects))
     told = {p.name: effects[n][p.name.split(".")[1]] for n in effects for p in effect_parameters(n)}
     fits, problem = [], ""
-    for start in (outcome.before, outcome.after):
+    starts = [outcome.before] if outcome.after is outcome.before else [outcome.before, outcome.after]
+    for start in starts:
         throw = {n: v for n, v in start.values.items() if "@" in n}
         try:
             fits.append(full_fit(simulation, model, {**throw, **parameters, **told}, budget=24))

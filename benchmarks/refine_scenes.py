@@ -93,7 +93,8 @@ def table(path):
         pair = "{:.1f} / {:.1f}".format
         shown = " + ".join([r["run"], *r["second"]])
         oracle = "–" if not told else told.get("problem") or pair(told["fit_mm"], told["held_out_mm"])
-        before, after = ([d[k][part]["rmse_mm"] for part in ("fit", "held_out")] for k in ("before", "after"))
+        parts = ("fit", "held_out")
+        before, after = ([d[k][part]["trajectory_rmse_mm"] for part in parts] for k in ("before", "after"))
         cells = (shown, ", ".join(r["true"]) or "none", ranked, values or d["verdict"], pair(*before), pair(*after),
                  oracle, f"{sum(r['seconds']):.0f}")  # fmt: skip
         print(f"| {' | '.join(cells)} |")
