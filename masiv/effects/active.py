@@ -78,6 +78,13 @@ def _open_grid(mpm):
     return OpenGrid(mpm)
 
 
+@functools.lru_cache(maxsize=64)
+def _grid_with(mpm, members: tuple):
+    from masiv.kernels.effects import GridWithEffects
+
+    return GridWithEffects(mpm, members)
+
+
 class BoundEffects:
     """The kernels of one rollout's effects."""
 
@@ -93,6 +100,7 @@ class BoundEffects:
         self.stress = [k for k, (e, _) in zip(self.kernels, members, strict=True) if e.on_stress]
         self.on_grid = bool(self.nodes or self.ground)
         self.grid = _open_grid(mpm) if self.on_grid else None
+        self.whole_grid = _grid_with(mpm, (*self.nodes, *self.ground)) if self.on_grid else None
 
     def write(self) -> None:
         """Fill the fields, which rollouts of one capacity share, and start the sums of gradients at zero."""
@@ -109,8 +117,15 @@ class BoundEffects:
             kernels.apply(s, self.count)
         self.mpm.p2g(s, self.count, nodes)
 
+    def grid_update(self, offset: int, time: float) -> None:
+        """The chunks' grids into the log at ``offset``, and velocities of the nodes: gravity, effects, contact."""
+        if self.on_grid:
+            self.whole_grid.grid_update(offset, time)
+        else:
+            self.mpm.grid_update(offset)
+
     def grid_velocities(self, offset: int, nodes: int, time: float) -> None:
-        """Velocities of the nodes from the log at ``offset``: gravity, effects, contact."""
+        """Velocities of the nodes from the log at ``offset``, and what ``grid_adjoint`` needs of them."""
         if not self.on_grid:
             return
         self.grid.free(offset, nodes)

@@ -105,15 +105,6 @@ class NodeKernels:
             out[i] = total[i]
 
     @ti.func
-    def node_position(self, n: ti.i32):
-        shape, origin = self.mpm.window_shape[None], self.mpm.window_origin[None]
-        k = n % shape[2]
-        j = (n // shape[2]) % shape[1]
-        i = n // (shape[2] * shape[1])
-        dx = self.mpm.constants[DX]
-        return ti.Vector([(origin[0] + i) * dx, (origin[1] + j) * dx, (origin[2] + k) * dx])
-
-    @ti.func
     def concerns(self, n: ti.i32):
         out = True
         if ti.static(self.grounded):
@@ -129,7 +120,7 @@ class NodeKernels:
         if ti.static(self.grounded):
             held = self.held[n]
         dt, dx = self.mpm.constants[DT], self.mpm.constants[DX]
-        x = self.node_position(n)
+        x = self.mpm.node_position(n)
         return self.function(x, v, held, ti.cast(t, self.mpm.real), dt, dx, self.coefficients[n])
 
     @ti.kernel
@@ -173,6 +164,52 @@ class NodeKernels:
         self.load(nodes)
         self.pointwise.grad(nodes, t)
         self.store(nodes)
+
+
+@ti.data_oriented
+class GridWithEffects:
+    """``grid_update`` with effects between gravity and contact, in one pass over the nodes that have mass: all that a
+    forward rollout needs. members: of ``NodeKernels``, that of the ground (one at most) last."""
+
+    def __init__(self, mpm, members):
+        self.mpm = mpm
+        self.functions = [m.function for m in members]
+        self.coefficients = [m.coefficients for m in members]
+        self.on_nodes = sum(not m.grounded for m in members)
+        self.on_ground = len(members) > self.on_nodes
+
+    @ti.func
+    def row_update(self, row: ti.i32, offset: ti.i32, t: ti.f64):
+        nz = self.mpm.window_shape[None][2]
+        dt, dx, now = self.mpm.constants[DT], self.mpm.constants[DX], ti.cast(t, self.mpm.real)
+        grounded = self.mpm.contact[None] != NO_GROUND and self.mpm.node_height(row) <= 0
+        for n in range(row * nz, (row + 1) * nz):
+            value = self.mpm.sum_of_chunks(n)
+            self.mpm.grid_momentum[offset + n] = value
+            v = ti.Vector.zero(self.mpm.real, 3)
+            if value[3] > 0.0:
+                v = momentum_of(value) / value[3] + dt * self.mpm.gravity()
+                x = self.mpm.node_position(n)
+                for e in ti.static(range(self.on_nodes)):
+                    v = self.functions[e](x, v, v, now, dt, dx, self.coefficients[e][0])
+                if grounded:
+                    held = self.mpm.contact_velocity(v)
+                    if ti.static(self.on_ground):
+                        held = self.functions[-1](x, v, held, now, dt, dx, self.coefficients[-1][0])
+                    v = held
+            self.mpm.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
+
+    @ti.kernel
+    def grid_update(self, offset: ti.i32, t: ti.f64):
+        if ti.static(self.mpm.gpu):
+            for row in range(self.mpm.rows()):
+                self.row_update(row, offset, t)
+        else:
+            ti.loop_config(block_dim=1)
+            for part in range(self.mpm.chunks):
+                rows = self.mpm.rows()
+                for row in range(part * rows // self.mpm.chunks, (part + 1) * rows // self.mpm.chunks):
+                    self.row_update(row, offset, t)
 
 
 @ti.data_oriented

@@ -94,6 +94,15 @@ class GridKernels:
         return self.window_origin[None][1] + row % self.window_shape[None][1]
 
     @ti.func
+    def node_position(self, n: ti.i32):
+        """Place [m] of the node with flat index n."""
+        shape, origin, dx = self.window_shape[None], self.window_origin[None], self.constants[DX]
+        k = n % shape[2]
+        j = (n // shape[2]) % shape[1]
+        i = n // (shape[2] * shape[1])
+        return ti.Vector([(origin[0] + i) * dx, (origin[1] + j) * dx, (origin[2] + k) * dx])
+
+    @ti.func
     def rows(self):
         return self.window_shape[None][0] * self.window_shape[None][1]
 

@@ -223,8 +223,7 @@ class Recording:
             for s in range(begin, end):
                 offset = self._log(s, nodes)
                 self.effects.p2g(self.bound, s, nodes)
-                k.grid_update(offset)
-                self.effects.grid_velocities(offset, nodes, self._instant(start + s))
+                self.effects.grid_update(offset, self._instant(start + s))
                 k.g2p(s, sim.count)
             self.logs[end] = self.logs[begin] + (end - begin) * nodes
             too_fast, outside = k.read_fault()
