@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from masiv.errors import InputError, MasivError
-from masiv.materials.law import BoundLaw, Law
+from masiv.materials.law import BoundLaw, Law, SharedBoundLaw
 
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
@@ -192,7 +192,7 @@ def _classical_kernels(mpm, kind: str, coefficients: int):
     return ClassicalKernels(mpm, kind, coefficients)
 
 
-class _BoundClassical(BoundLaw):
+class _BoundClassical(SharedBoundLaw):
     def __init__(self, law: ClassicalLaw, mpm: MpmKernels, count: int, dt: float) -> None:
         self.law = law
         self.dt = dt
@@ -201,32 +201,15 @@ class _BoundClassical(BoundLaw):
         self.kernels = _classical_kernels(mpm, law.kind, len(self.values))
         dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
         self.per_particle = self.values.detach().to(dtype).expand(count, -1).contiguous()
-        self._write()
-
-    def _write(self) -> None:
-        self.kernels.write_coefficients(self.per_particle)
-        self.kernels.owner = self
-
-    def _own(self) -> None:
-        if self.kernels.owner is not self:  # another rollout used the same fields since
-            self._write()
-
-    def forward(self, s: int, count: int) -> None:
         self._own()
-        self.kernels.forward(s, count)
 
-    def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
-        if mpm.gpu:
-            super().p2g(mpm, s, count, nodes)
-        else:
-            self._own()
-            self.kernels.forward_p2g(s, count, nodes)
+    def write(self) -> None:
+        self.kernels.write_coefficients(self.per_particle)
 
     def backward(self, s: int, count: int) -> None:
         if self.law.kind not in DIFFERENTIABLE:
             raise MasivError(f"law {self.law.kind} has no adjoint: identify with a neural law, or with neo_hookean")
-        self._own()
-        self.kernels.backward(s, count)
+        super().backward(s, count)
 
     def parameter_gradients(self) -> tuple[torch.Tensor | None, ...]:
         gradient = torch.empty_like(self.per_particle)

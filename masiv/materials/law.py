@@ -33,6 +33,36 @@ class BoundLaw(ABC):
         """Gradients with respect to ``Law.parameters()``, in that order, since the binding."""
 
 
+class SharedBoundLaw(BoundLaw):
+    """One whose kernels have a single set of fields for its coefficients, which rollouts use in turn."""
+
+    kernels: Any
+
+    @abstractmethod
+    def write(self) -> None:
+        """Fill the fields; sums of gradients start at zero."""
+
+    def _own(self) -> None:
+        if self.kernels.owner is not self:  # another rollout used the same fields since
+            self.write()
+            self.kernels.owner = self
+
+    def forward(self, s: int, count: int) -> None:
+        self._own()
+        self.kernels.forward(s, count)
+
+    def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
+        if mpm.gpu:
+            super().p2g(mpm, s, count, nodes)
+        else:
+            self._own()
+            self.kernels.forward_p2g(s, count, nodes)
+
+    def backward(self, s: int, count: int) -> None:
+        self._own()
+        self.kernels.backward(s, count)
+
+
 class Law(torch.nn.Module, ABC):
     """Elastic stress and plastic flow of a material.
 

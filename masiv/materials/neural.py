@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from masiv.materials import table
-from masiv.materials.law import BoundLaw, Law
+from masiv.materials.law import BoundLaw, Law, SharedBoundLaw
 
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
@@ -160,7 +160,7 @@ def _neural_kernels(mpm):
     return NeuralKernels(mpm)
 
 
-class _BoundNeural(BoundLaw):
+class _BoundNeural(SharedBoundLaw):
     """The networks run once here; kernels interpolate their tables."""
 
     def __init__(self, law: NeuralLaw, mpm: MpmKernels, count: int, dt: float) -> None:
@@ -171,32 +171,12 @@ class _BoundNeural(BoundLaw):
         with torch.enable_grad():
             self.tables = (law.moduli_table(), law.rate_table(), torch.exp(law.log_flow_strain))
         self.dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
-        self._write()
+        self._own()
 
-    def _write(self) -> None:
+    def write(self) -> None:
         moduli, rates = (t.detach().to(self.dtype).contiguous() for t in self.tables[:2])
         flow_strain = float(self.tables[2].detach())
         self.kernels.write_tables(moduli, rates, STRAIN_SCALE, flow_strain, self.dt, self.count)
-        self.kernels.owner = self
-
-    def _own(self) -> None:
-        if self.kernels.owner is not self:  # another rollout used the same fields since
-            self._write()
-
-    def forward(self, s: int, count: int) -> None:
-        self._own()
-        self.kernels.forward(s, count)
-
-    def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
-        if mpm.gpu:
-            super().p2g(mpm, s, count, nodes)
-        else:
-            self._own()
-            self.kernels.forward_p2g(s, count, nodes)
-
-    def backward(self, s: int, count: int) -> None:
-        self._own()
-        self.kernels.backward(s, count)
 
     def parameter_gradients(self) -> tuple[torch.Tensor | None, ...]:
         bars = [torch.empty(len(self.tables[0]), width, dtype=self.dtype) for width in (4, 2)]
