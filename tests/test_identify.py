@@ -85,6 +85,18 @@ def test_launch_of_a_rigid_throw(body):
     np.testing.assert_allclose(late.velocity, VELOCITY, atol=1e-5)
 
 
+def test_flight_ends_where_the_body_hits_what_nobody_declared(body):
+    times = np.arange(8) / FPS
+    path = body + VELOCITY * times[:, None, None] + 0.5 * GRAVITY * times[:, None, None] ** 2
+    path[1:] += 1e-3 * np.random.default_rng(0).normal(size=path[1:].shape)
+    free = estimate_launch(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
+    assert free.last_frame == 7
+    for frame in (5, 6, 7):  # flattened, ever more
+        path[frame, :, 1] = path[frame].mean(0)[1] + (1 - 0.1 * (frame - 4)) * (path[frame] - path[frame].mean(0))[:, 1]
+    launch = estimate_launch(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
+    assert launch.last_frame == 4
+
+
 def settings(**changes):
     fast = dict(start="jelly", contact="sticky", iterations=14, silhouette_pictures=0, search_particles=200)
     return IdentifyConfig(**(fast | changes))

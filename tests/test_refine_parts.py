@@ -12,7 +12,7 @@ from masiv.identify.parametric import Parameter
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess, explains_too_little, simplest
 from masiv.refine.noise import uncertainties
-from masiv.refine.refit import leapt, strengths_alone
+from masiv.refine.refit import best_strength, leapt, strengths_alone
 
 INSTANTS, ROWS, POINTS = 6, 4, 5
 NOISE = 1e-3
@@ -68,6 +68,17 @@ def test_strengths_are_found_with_the_rest_as_it_is():
     values = strengths_alone(simulation, None, {"a": 5.0, "b": -30.0}, parameters()[1:], soft=1e6)
     assert values["a"] == 5.0
     assert values["b"] == pytest.approx(1.5, rel=2e-3)
+
+
+def test_a_strength_whose_effect_begins_late_is_found_by_trying():
+    class Kinked(Linear):  # below 3 the effect does nothing
+        def residual(self, model, values):
+            return np.full(6, max(values["b"] - 3.0, 0.0) - 5.0)
+
+    strengths = [Parameter("b", 0.0, 0.0, 20.0, 1e-3)]
+    values, cost = best_strength(Kinked(np.eye(2), 0.0), None, {"a": 1.0, "b": 2.0}, strengths, soft=1e6)
+    assert values == {"a": 1.0, "b": 8.0}
+    assert cost == pytest.approx(0.0, abs=1e-9)
 
 
 def test_what_a_fit_absorbs_is_no_uncertainty():

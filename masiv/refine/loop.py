@@ -14,11 +14,13 @@ from masiv.refine.evidence import above_noise, excess, objections, simplest
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import (
     Fitted,
+    best_strength,
     chord_fit,
     column,
     full_fit,
     leapt,
     reweighted,
+    robust_cost,
     softness,
     strengths_alone,
     summarised,
@@ -240,6 +242,12 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
     values, residual, jacobian = chord_fit(
         simulation, model, first, values, residual, jacobian, steps=CHORD_STEPS, soft=soft
     )
+    cost = robust_cost(residual, soft)
+    if base.cost - cost < 0.5 * candidate.explained * base.cost:  # far from the promise: not linear about zero
+        theta = {p.name: candidate.theta[p.name] for p in term.parameters}
+        jump, jumped = best_strength(simulation, model, {**base.values, **theta}, term.strengths, soft)
+        if jumped < cost:
+            return full_fit(simulation, model, jump, budget=2 * len(params) + 6, soft=soft)
     for _ in range(2 if others else 0):
         extra = [p for p in params if p.name in others]
         wide = np.column_stack([jacobian, *[column(simulation, model, values, residual, p) for p in extra]])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from masiv.identify.launch import beyond_rigid
 from masiv.refine.refit import Fitted
 from masiv.refine.simulated import Simulated
 
@@ -18,17 +18,6 @@ def noise_floor(positions: np.ndarray, last_frame: int) -> float:
     they are taken to be as large again. Where the body touches at once, frame 1 has to do.
     """
     return float(np.sqrt(2 * np.mean(beyond_rigid(positions[: max(2, last_frame)]) ** 2)))
-
-
-def beyond_rigid(positions: np.ndarray) -> np.ndarray:
-    """Root mean square distance (T - 1,) [m] of positions (T, N, 3) [m] after the first from its best rigid motion."""
-    start = positions[0] - positions[0].mean(0)
-    out = []
-    for later in positions[1:]:
-        now = later - later.mean(0)
-        turn = Rotation.align_vectors(now, start)[0]
-        out.append(np.sqrt(((now - turn.apply(start)) ** 2).sum(1).mean()))
-    return np.array(out)
 
 
 def uncertainties(simulation: Simulated, fitted: Fitted) -> list[np.ndarray]:

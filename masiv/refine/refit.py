@@ -15,6 +15,8 @@ from masiv.refine.model import Model
 from masiv.refine.simulated import Simulated, Watched
 
 LEAST_GAIN = 1e-3
+MULTIPLES = (0.25, 1.0, 4.0)
+"""Of a strength that the linear model promised, which are tried where it misled."""
 LOG_LEAP = 0.7
 """By how much the logarithm of a parameter may change at once."""
 
@@ -189,6 +191,23 @@ def strengths_alone(
     residual = simulation.residual(model, absent)
     columns = np.stack([column(simulation, model, absent, residual, p) for p in strengths], axis=1)
     return leapt(simulation, model, strengths, absent, residual, columns, soft=soft)[0]
+
+
+def best_strength(
+    simulation: Simulated, model: Model, values: Mapping[str, float], strengths: Sequence[Parameter], soft: float
+) -> tuple[dict[str, float], float]:
+    """``values`` with the ``strengths`` at the best of some multiples of theirs, all else as it is; and its cost [m^2]:
+    what contact does has kinks, and derivatives about zero may not say where it begins to matter."""
+    best, least = dict(values), math.inf
+    for times in MULTIPLES:
+        scaled = {p.name: float(np.clip(times * values[p.name], p.lower, p.upper)) for p in strengths}
+        try:
+            cost = robust_cost(simulation.residual(model, {**values, **scaled}), soft)
+        except NonFiniteError:
+            continue
+        if cost < least:
+            best, least = {**values, **scaled}, cost
+    return best, least
 
 
 def reweighted(simulation: Simulated, base: Fitted, *, steps: int, soft: float) -> Fitted:
