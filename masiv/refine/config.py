@@ -42,5 +42,5 @@ class RefineConfig(BaseModel):
         "certain as the observation, to be accepted although held-out frames are too uncertain to tell",
     )  # fmt: skip
     least_bic: float = Field(10.0, ge=0, description="how far an effect must lower the information criterion")
-    least_sigmas: float = Field(4.0, ge=0, description="standard errors that a strength must lie from zero")
+    least_sigmas: float = Field(3.0, ge=0, description="standard errors that a strength must lie from zero")
     confusable: float = Field(0.95, gt=0, le=1, description="correlation from which two effects look alike")

@@ -182,6 +182,8 @@ def _round(
     accepted = None
     for trial in trials:
         trial.reasons = _reasons(simulation, current, trial, config)
+    for trial, reason in [(t, _outdone(simulation, current, t, trials, config)) for t in trials if t.passes]:
+        trial.reasons += reason
     chosen = simplest([t.fitted for t in trials if t.passes], simulation.experiments)
     if chosen is not None:
         trial = next(t for t in trials if t.fitted is chosen)
@@ -271,6 +273,24 @@ def _reasons(simulation: Simulated, before: Fitted, trial: Trial, config: Refine
     term = simulation.term(trial.candidate.effect)
     general = objections(before, trial.fitted, term, simulation.experiments, config)
     return [*general, *simulation.objections(before, trial.fitted, term, config)]
+
+
+def _outdone(
+    simulation: Simulated, before: Fitted, trial: Trial, trials: Sequence[Trial], config: RefineConfig
+) -> list[str]:
+    """Why ``trial``, which passes, must not be named: a cause that is no richer explains more, and is not certain. (One
+    that physics forbids does not count.)"""
+    samples = min((t.fitted for t in trials), key=lambda f: f.cost).samples
+    for other in trials:
+        if (
+            not other.passes
+            and other.candidate.effect != trial.candidate.effect
+            and len(other.fitted.parameters) <= len(trial.fitted.parameters)
+            and other.fitted.bic(samples) < trial.fitted.bic(samples) - TELLS_APART
+            and not simulation.objections(before, other.fitted, simulation.term(other.candidate.effect), config)
+        ):
+            return [f"{other.candidate.effect} explains more with no more parameters, and is not certain"]
+    return []
 
 
 def _confusable(ranking: list[Candidate], trials: list[Trial], least: float) -> dict[str, list[str]]:
