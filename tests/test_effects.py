@@ -121,7 +121,7 @@ def test_two_effects_cannot_both_be_the_contact():
 def test_several_effects_at_once():
     """Grid, ground, stress and masses in one rollout: each gradient against finite differences."""
     x = body()
-    names = ("linear_drag", "ground_friction", "viscosity", "point_mass", "swirl")
+    names = ("linear_drag", "ground_friction", "viscosity", "point_mass", "point_force", "swirl")
     thetas = [present(effects()[name]).requires_grad_() for name in names]
 
     def loss(values):

@@ -130,6 +130,47 @@ def test_point_mass_adds_what_it_says_and_moves_the_centre_of_mass():
     torch.testing.assert_close((share * positions[-1]).sum(0) - centre, expected, rtol=0, atol=1e-9)
 
 
+def test_mass_is_at_its_place_inside_and_in_the_outermost_layer_at_a_face():
+    x = body(height=5.0)
+    effect, known = effects()["point_mass"], setting(x)
+    for place in ([0.1, 5.1, 0.1], [0.13, 5.06, 0.12], [0.17, 5.1, 0.04]):
+        added = effect.mass_factor(torch.tensor([2.0, *place], dtype=F64), known) - 1
+        assert known.particle_mass * added.sum().item() == pytest.approx(2.0, rel=1e-9)
+        np.testing.assert_allclose((added[:, None] * x).sum(0) / added.sum(), place, atol=1e-4)
+    lattice = torch.cartesian_prod(*[torch.arange(0.005, 0.2, 0.01, dtype=F64)] * 3)
+    known = setting(lattice)
+    added = effect.mass_factor(torch.tensor([2.0, 0.1, 0.195, 0.1], dtype=F64), known) - 1
+    middle = (added[:, None] * lattice).sum(0) / added.sum()
+    # a Gaussian of radius 0.025 cut in two would be at 0.175
+    np.testing.assert_allclose(middle, [0.1, 0.192, 0.1], atol=2e-3)
+    assert added.max() < 0.05 * added.sum()
+
+
+def test_point_force_moves_the_whole_as_its_sum_and_turns_it_about_its_middle():
+    x, force = body(height=5.0), torch.tensor([4.0, 0.0, 2.0], dtype=F64)
+    place = torch.tensor([0.1, 5.15, 0.1], dtype=F64)
+    positions = run("point_force", [*force.tolist(), *place.tolist()], 50, x=x, gravity=WEIGHTLESS)
+    mass, t = 8.0, 0.05
+    np.testing.assert_allclose(last_velocity(positions), (force * t / mass).numpy(), rtol=0.03, atol=1e-9)
+    spin = torch.linalg.cross(positions[-1] - positions[-1].mean(0), (positions[-1] - positions[-2]) / DT).sum(0)
+    expected = torch.linalg.cross(place - x.mean(0), force) * t / (mass / len(x))
+    np.testing.assert_allclose(spin.numpy(), expected.numpy(), rtol=0.05, atol=2.0)
+
+
+def test_point_force_on_a_heavier_body_moves_it_less():
+    x = body(height=5.0)
+    kind = {"gravity": torch.zeros(3)}
+    members = tuple(
+        (effects()[n], torch.tensor(v, dtype=F64))
+        for n, v in (("point_mass", [8.0, 0.1, 5.1, 0.1]), ("point_force", [4.0, 0, 0, 0.1, 5.1, 0.1]))
+    )
+    active = ActiveEffects(members, setting(x))
+    moved = rollout(simulator(len(x), **kind), LAW, thrown(x, *torch.zeros(2, 3, dtype=F64)), 40, [39, 40], active)
+    share = (active.mass_factor() / active.mass_factor().sum())[:, None]
+    velocity = (share * (moved[-1] - moved[-2]) / DT).sum(0)
+    np.testing.assert_allclose(velocity.numpy(), [4.0 * 0.04 / 16.0, 0, 0], rtol=0.03, atol=1e-9)
+
+
 def test_hidden_obstacle_stops_a_body_at_its_surface():
     x = body(height=5.0)
     centre, radius = torch.tensor([0.1, 4.65, 0.1], dtype=F64), 0.3

@@ -44,6 +44,11 @@ class ActiveEffects:
         """Product (N,) of the factors of mass, or None where no effect has one."""
         return _product(effect.mass_factor(theta, self.setting) for effect, theta in self.members)
 
+    def force(self) -> torch.Tensor | None:
+        """Sum (N, 3) [N] of the forces on the particles, or None where no effect has one."""
+        forces = [f for effect, theta in self.members if (f := effect.force(theta, self.setting)) is not None]
+        return functools.reduce(torch.add, forces) if forces else None
+
     def ground_shift(self) -> torch.Tensor:
         """How far () [m] the ground is raised."""
         return _sum(effect.ground_shift(theta) for effect, theta in self.members)
@@ -72,6 +77,13 @@ def _kernels(mpm, effect: Effect, coefficients: int):
 
 
 @functools.lru_cache(maxsize=8)
+def _force_kernels(mpm):
+    from masiv.kernels.effects import ForceKernels
+
+    return ForceKernels(mpm)
+
+
+@functools.lru_cache(maxsize=8)
 def _open_grid(mpm):
     from masiv.kernels.effects import OpenGrid
 
@@ -88,8 +100,15 @@ def _grid_with(mpm, members: tuple):
 class BoundEffects:
     """The kernels of one rollout's effects."""
 
-    def __init__(self, members: Sequence[tuple[Effect, torch.Tensor]], mpm: MpmKernels, count: int) -> None:
-        """members: each with its coefficients (K,) or (N, K), in the order of ``ActiveEffects.kernel_members``."""
+    def __init__(
+        self,
+        members: Sequence[tuple[Effect, torch.Tensor]],
+        mpm: MpmKernels,
+        count: int,
+        force: torch.Tensor | None = None,
+    ) -> None:
+        """members: each with its coefficients (K,) or (N, K), in the order of ``ActiveEffects.kernel_members``; force
+        (N, 3) [N] on the particles."""
         self.mpm = mpm
         self.count = count
         self.dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
@@ -101,11 +120,33 @@ class BoundEffects:
         self.on_grid = bool(self.nodes or self.ground)
         self.grid = _open_grid(mpm) if self.on_grid else None
         self.whole_grid = _grid_with(mpm, (*self.nodes, *self.ground)) if self.on_grid else None
+        self.force = None if force is None else force.detach().to(self.dtype).contiguous()
+        self.push = None if force is None else _force_kernels(mpm)
 
     def write(self) -> None:
         """Fill the fields, which rollouts of one capacity share, and start the sums of gradients at zero."""
         for kernels, values in zip(self.kernels, self.values, strict=True):
             kernels.write(values)
+        if self.push is not None:
+            self.push.write(self.force)
+
+    def after(self, s: int) -> None:
+        """What acts on the particles, when substep s has ended."""
+        if self.push is not None:
+            self.push.apply(s + 1, self.count)
+
+    def after_adjoint(self, s: int) -> None:
+        """Adjoint of ``after``; the state that it made is undone."""
+        if self.push is not None:
+            self.push.adjoint(s + 1, self.count)
+
+    def force_gradient(self) -> torch.Tensor | None:
+        """Adjoint (N, 3) of the force since ``write``."""
+        if self.push is None:
+            return None
+        out = torch.empty_like(self.force)
+        self.push.read_gradient(out)
+        return out
 
     def p2g(self, law: BoundLaw, s: int, nodes: int) -> None:
         """Law, effects on the stress, transfer to the grid."""

@@ -67,6 +67,8 @@ class Effect(ABC):
     on_stress: ClassVar[bool] = False
     cause: ClassVar[bool] = True
     """False for a stop-gap, which no search may name."""
+    on_held: ClassVar[bool] = False
+    """Whether it acts on a body that is held somewhere: on a free one it is nothing but another effect."""
 
     of_body: ClassVar[bool] = False
     """Whether the strength depends on the body (a drag), so that bodies may differ; else it is that of the
@@ -98,6 +100,10 @@ class Effect(ABC):
 
     def mass_factor(self, theta: torch.Tensor, setting: Setting) -> torch.Tensor | None:
         """Factor (N,) of the particles' masses, or None where the effect leaves masses alone."""
+        return None
+
+    def force(self, theta: torch.Tensor, setting: Setting) -> torch.Tensor | None:
+        """Force (N, 3) [N] on each particle, the same at all times, or None."""
         return None
 
     def ground_shift(self, theta: torch.Tensor) -> torch.Tensor | None:

@@ -1,17 +1,18 @@
-"""Something heavy inside."""
+"""Something heavy inside, or hung on."""
 
 from __future__ import annotations
 
 import torch
 
-from masiv.effects._place import PLACE, as_guesses, cover, square_distance
+from masiv.effects._place import PLACE, as_guesses, cover, faces, shares
 from masiv.effects.effect import Effect, EffectParameter
 
 
 class PointMass(Effect):
-    """Mass added around a place of the body at frame 0, spread as exp(-|X - place|^2 / (2 r^2)), r 1/8 of its size.
+    """Mass added round a place of the body at frame 0, a Gaussian of radius 1/8 of its size whose middle is the place.
 
-    The particles share it in full, wherever the place is: their masses grow by exactly the parameter.
+    The particles share it in full, wherever the place is: their masses grow by exactly the parameter. At a surface it
+    lies in the outermost particles.
     """
 
     name = "point_mass"
@@ -19,10 +20,8 @@ class PointMass(Effect):
     parameters = (EffectParameter("mass", "kg", 0.0, 1000.0, 1.0), *PLACE)
 
     def mass_factor(self, theta, setting):
-        radius = setting.size / 8
-        share = torch.softmax(-0.5 * square_distance(setting.rest, theta[1:4]) / radius**2, 0)
-        return 1 + theta[0] / setting.particle_mass * share
+        return 1 + theta[0] / setting.particle_mass * shares(setting.rest, theta[1:4], setting.size / 8)
 
     def guesses(self, setting):
-        """Middles of eight parts of the body: mass in its very middle would hardly show."""
-        return as_guesses(cover(setting.rest, 8))
+        """Middles of six parts of the body (mass in its very middle would hardly show) and of its faces."""
+        return as_guesses(torch.cat([cover(setting.rest, 6), faces(setting.rest)]))

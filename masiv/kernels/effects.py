@@ -213,6 +213,46 @@ class GridWithEffects:
 
 
 @ti.data_oriented
+class ForceKernels:
+    """A force (N, 3) [N] on the particles that does not change: v += dt f / m at the end of each substep."""
+
+    def __init__(self, mpm):
+        self.mpm = mpm
+        self.force = ti.Vector.field(3, mpm.real, shape=mpm.capacity_particles)
+        self.total = ti.Vector.field(3, mpm.real, shape=mpm.capacity_particles)
+
+    @ti.kernel
+    def write(self, values: ti.types.ndarray()):
+        """values (N, 3); the sums of their gradients start at zero."""
+        for p in range(values.shape[0]):
+            for i in ti.static(range(3)):
+                self.force[p][i] = values[p, i]
+                self.total[p][i] = 0.0
+
+    @ti.kernel
+    def read_gradient(self, out: ti.types.ndarray()):
+        for p in range(out.shape[0]):
+            for i in ti.static(range(3)):
+                out[p, i] = self.total[p][i]
+
+    @ti.kernel
+    def apply(self, s: ti.i32, count: ti.i32):
+        """Of the velocities at the start of substep s, which G2P of the one before has written."""
+        for p in range(count):
+            self.mpm.velocity[s, p] += (self.mpm.constants[DT] / self.mpm.particle_mass[p]) * self.force[p]
+
+    @ti.kernel
+    def adjoint(self, s: ti.i32, count: ti.i32):
+        """Sums up the adjoint; the velocities become what G2P wrote, of which its own adjoint is."""
+        for p in range(count):
+            per_force = self.mpm.constants[DT] / self.mpm.particle_mass[p]
+            bar = self.mpm.velocity_bar[p]
+            self.total[p] += per_force * bar
+            self.mpm.mass_bar[p] -= per_force / self.mpm.particle_mass[p] * bar.dot(self.force[p])
+            self.mpm.velocity[s, p] -= per_force * self.force[p]
+
+
+@ti.data_oriented
 class StressKernels:
     """``function(tau, F, C, c) -> tau`` on particles: Kirchhoff stress [Pa], elastic deformation gradient, affine
     velocity (the velocity gradient) [1/s], coefficients of the particle."""

@@ -37,11 +37,14 @@ def _leaves(effects: ActiveEffects) -> ActiveEffects:
 
 
 def _through(recording, effects: ActiveEffects | None, adjoint) -> list[torch.Tensor | None]:
-    """Adjoints of the effects' parameters, from those of coefficients and masses."""
+    """Adjoints of the effects' parameters, from those of coefficients, masses and forces."""
     if effects is None:
         return []
     outputs = [*recording.coefficients, recording.mass]
     bars = [*adjoint.coefficients, adjoint.mass]
+    if recording.force is not None:
+        outputs.append(recording.force)
+        bars.append(adjoint.force)
     used = [(o, b.to(o.dtype)) for o, b in zip(outputs, bars, strict=True) if o.requires_grad]
     if not used:
         return [None] * len(effects.members)

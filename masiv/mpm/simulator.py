@@ -148,12 +148,14 @@ class Simulator:
 
 @dataclass(frozen=True)
 class Adjoint:
-    """Adjoints of a rollout's inputs: initial state, the law's parameters, coefficients of the effects, masses (N,)."""
+    """Adjoints of a rollout's inputs: initial state, the law's parameters, coefficients of the effects, masses (N,),
+    and forces (N, 3) where there are any."""
 
     state: State
     law: tuple[torch.Tensor | None, ...]
     coefficients: list[torch.Tensor]
     mass: torch.Tensor
+    force: torch.Tensor | None
 
 
 class Recording:
@@ -176,10 +178,12 @@ class Recording:
         self.time = time
         members = effects.kernel_members if effects else []
         self.coefficients = effects.coefficients() if effects else []
+        self.force = effects.force() if effects else None
         self.effects = BoundEffects(
             [(effect, c) for (effect, _), c in zip(members, self.coefficients, strict=True)],
             simulator.k,
             simulator.count,
+            self.force,
         )
         factor = effects.mass_factor() if effects else None
         self.mass = simulator.mass if factor is None else simulator.mass * factor.to(simulator.dtype)
@@ -225,6 +229,7 @@ class Recording:
                 self.effects.p2g(self.bound, s, nodes)
                 self.effects.grid_update(offset, self._instant(start + s))
                 k.g2p(s, sim.count)
+                self.effects.after(s)
             self.logs[end] = self.logs[begin] + (end - begin) * nodes
             too_fast, outside = k.read_fault()
             if too_fast >= 0:
@@ -289,6 +294,7 @@ class Recording:
                     k.grid_update(offset)
                 instant = self._instant(start + s)
                 self.effects.grid_velocities(offset, nodes, instant)
+                self.effects.after_adjoint(s)
                 k.g2p_adjoint(s, sim.count, nodes)
                 if self.effects.on_grid:
                     self.effects.grid_adjoint(offset, nodes, instant)
@@ -304,4 +310,7 @@ class Recording:
         k.read_bars(*out)
         mass = torch.empty(sim.count, dtype=sim.dtype)
         k.read_mass_bar(mass)
-        return Adjoint(State(*out), self.bound.parameter_gradients(), self.effects.gradients(), mass)
+        force = self.effects.force_gradient()
+        if force is not None:
+            k.owner = None  # their adjoint undoes the states
+        return Adjoint(State(*out), self.bound.parameter_gradients(), self.effects.gradients(), mass, force)

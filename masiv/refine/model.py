@@ -114,7 +114,8 @@ class Simulation:
         """Effects that ``model`` lacks; one contact with the ground at most, and none where there is no ground."""
         library = causes()
         taken = model.contact == "none" or any(effect_named(n).on_grid == "ground" for n in model.effects)
-        return [n for n, e in library.items() if n not in model.effects and not (taken and e.on_grid == "ground")]
+        apart = (*model.effects, *(n for n, e in library.items() if e.on_held))  # nothing holds a thrown body
+        return [n for n, e in library.items() if n not in apart and not (taken and e.on_grid == "ground")]
 
     def term(self, name: str) -> Term:
         """The effect, of all that is filmed; its guesses are of the first experiment."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,19 +60,27 @@ class SimulatedBody:
         """[kg]"""
         return self.density * self.volume
 
-    def released(self, dtype: torch.dtype = torch.float32) -> State:
-        """The state at the release: at rest in the shape that it is held in, which is taken to be free of stress."""
-        x = self.particles.to(dtype)
-        return at_rest(x, torch.zeros_like(x), torch.zeros(len(x), 3, 3, dtype=dtype))
+    @property
+    def size(self) -> float:
+        """Longest side [m] of the particles' bounding box."""
+        return float((self.particles.max(0).values - self.particles.min(0).values).max())
+
+    def released(self, dtype: torch.dtype = torch.float32, lift: float = 0.0) -> State:
+        """The state at the release: at rest, free of stress where ``lift`` [m] is 0, see ``masiv.tracks.bent``."""
+        from masiv.tracks.bent import bent
+
+        x, gradient = bent(self, lift)
+        still = torch.zeros_like(x, dtype=dtype)
+        return replace(at_rest(x.to(dtype), still, torch.zeros_like(gradient, dtype=dtype)),
+                       trial_gradient=gradient.to(dtype).contiguous())  # fmt: skip
 
     def effects(self, members: tuple = (), *, duration: float, frame_time: float) -> ActiveEffects:
         """Effects with their parameters, and after them the clamp."""
         from masiv.effects._clamp import clamped
 
         x = self.particles
-        size = float((x.max(0).values - x.min(0).values).max())
         gravity = torch.as_tensor(self.gravity, dtype=x.dtype)
-        setting = Setting(gravity, x, self.mass / len(x), size, duration, frame_time)
+        setting = Setting(gravity, x, self.mass / len(x), self.size, duration, frame_time)
         active = ActiveEffects(tuple(members), setting)
         return clamped(active, self.normals, self.heights) if len(self.heights) else active
 

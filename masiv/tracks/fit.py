@@ -57,11 +57,14 @@ def simulation_of(
 
     def made(particles: int) -> list[BodyRun]:
         spacing = (body.geometry.volume / particles) ** (1 / 3)
-        return [body_run(tracks, run, simulator, spacing, config.duration) for run in runs_of(tracks, condition)]
+        return [
+            body_run(tracks, run, simulator, spacing, config.duration, config.skip)
+            for run in runs_of(tracks, condition)
+        ]
 
     runs = made(config.particles)
     last = max(float(run.times[-1]) for run in runs)
-    horizons = [h for k in range(16) if (h := config.search_duration * 2**k) < 0.9 * last]
+    horizons = [h for k in range(16) if (h := config.skip + config.search_duration * 2**k) < 0.9 * last]
     return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder)
 
 
@@ -83,7 +86,7 @@ def fit_law(simulation: BodySimulation, family: Family, config: TracksConfig, pr
     over ever more of the motion. Raises MasivError where every law diverges."""
     contact = "sticky" if simulation.ground else "none"
     model = Model(family, contact)
-    horizon, last = config.search_duration, max(float(run.times[-1]) for run in simulation.experiments)
+    horizon, last = config.skip + config.search_duration, max(float(run.times[-1]) for run in simulation.experiments)
     values = _searched(_cut(simulation, horizon), model, progress)
     while True:
         horizon = min(2 * horizon, last)

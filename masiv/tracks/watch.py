@@ -29,6 +29,7 @@ from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model
 from masiv.refine.refit import Fitted, rms_mm
 from masiv.refine.simulated import Term, WholeRun
+from masiv.tracks.bent import across
 from masiv.tracks.body import Plan, SimulatedBody, plan, simulated_body
 from masiv.tracks.points import outline_of
 from masiv.tracks.tracks import Run, Tracks
@@ -39,6 +40,8 @@ FINEST_OUTPUT = 2.5e-3
 """Time [s] between two states of a rollout that are kept; motion between them is a cubic spline."""
 STABLE = 1.3
 """A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
+LIFT_REACH, LIFT_STEP = 0.2, 0.01
+"""In sizes of the body."""
 KEPT = 24
 LOST = 1.2
 """Residual over the swing about its mean from which the phase is lost; of two swings in step it is less than 1."""
@@ -51,7 +54,8 @@ BESIDE = 0.15
 class BodyRun(WholeRun):
     """A run from its release on: observed (K, M, 3) [m, world] of the markers tied to the body at ``times`` (K,) [s
     since the release that the reader found], frames where one is not seen left out. speed [m/s]: their greatest;
-    noise [m], sigma (K,): see ``masiv.refine.simulated.Watched``, the noise while the body is held."""
+    noise [m], sigma (K,): see ``masiv.refine.simulated.Watched``, the noise while the body is held; skip [s]: the
+    time after the release that is left out."""
 
     name: str
     condition: str
@@ -62,6 +66,7 @@ class BodyRun(WholeRun):
     speed: float
     noise: float
     sigma: np.ndarray
+    skip: float = 0.0
 
     @property
     def places(self) -> np.ndarray:
@@ -69,17 +74,31 @@ class BodyRun(WholeRun):
 
     @property
     def starts(self) -> tuple[Parameter, ...]:
-        """How much later [s] it was let go, and how far [m] from its rest it was held along two horizontal axes."""
-        aside = (Parameter(f"aside_{k}@{self.name}", 0.0, -ASIDE_REACH, ASIDE_REACH, ASIDE_STEP) for k in (1, 2))
-        return (Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP), *aside)
+        """How much later [s] it was let go, and how far [m] from its rest it was held along two horizontal axes.
+
+        Where its first moments are left out, also how far above its rest it was held, and an effective lift [m] at the
+        start (see ``masiv.tracks.bent``), for the energy that they took or gave."""
+        axes = ("aside_1", "aside_2") if not self.skip else ("aside_1", "aside_2", "above")
+        aside = (Parameter(f"{axis}@{self.name}", 0.0, -ASIDE_REACH, ASIDE_REACH, ASIDE_STEP) for axis in axes)
+        lift = () if not self.skip or across(self.body) is None else (self._lift(),)
+        return (Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP), *aside, *lift)
+
+    def _lift(self) -> Parameter:
+        size = self.body.size
+        return Parameter(f"lift@{self.name}", 0.0, -LIFT_REACH * size, LIFT_REACH * size, LIFT_STEP * size)
 
 
-def body_run(tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, duration: float) -> BodyRun:
-    """``run`` for ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises InputError."""
+def body_run(
+    tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, duration: float, skip: float = 0.0
+) -> BodyRun:
+    """``run`` from ``skip`` to ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises
+    InputError."""
+    if not skip < duration:
+        raise InputError(f"tracks.skip {skip:g} s leaves nothing of tracks.duration {duration:g} s")
     if run.release is None:
         raise InputError(f"{tracks.path}: run {run.name}: nobody knows when it was let go: give rest_frames")
     body = simulated_body(tracks, run, config, particle_spacing=spacing)
-    cut = run.between(run.release, run.release + duration)
+    cut = run.between(run.release + skip, run.release + duration)
     markers = list(body.markers)
     whole = np.asarray(np.isfinite(cut.positions[:, markers]).all(axis=(1, 2)), bool)
     if whole.mean() < LEAST_SEEN or whole.sum() < 6:
@@ -92,7 +111,8 @@ def body_run(tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, 
     speed = float(np.linalg.norm(np.diff(observed, axis=0), axis=2).max() / np.diff(times).min())
     noise = 1e-6 if run.noise is None else max(float(np.sqrt((run.noise[markers] ** 2).sum(1).mean())), 1e-6)
     sigma = np.full(len(times), noise)
-    return BodyRun(run.name, run.condition, times, observed, body, run.purpose == "fit", speed, noise, sigma)
+    return BodyRun(run.name, run.condition, times, observed, body, run.purpose == "fit", speed, noise, sigma,
+                   skip)  # fmt: skip
 
 
 class BodySimulation:
@@ -118,8 +138,8 @@ class BodySimulation:
         self.known = dict(known or {})
         self.outline: Outline = outline_of(tracks, next(iter(tracks.bodies.values())))
         self.ground = tracks.ground is not None
-        self.across = np.linalg.svd(tracks.up[None])[2][1:]
-        """Two horizontal axes (2, 3), world."""
+        self.across = np.concatenate([np.linalg.svd(tracks.up[None])[2][1:], tracks.up[None]])
+        """Two horizontal axes and the vertical one (3, 3), world."""
         self.rollouts = 0
         self.substeps: dict[tuple[str, float], float] = {}
         self.kept: dict[tuple, CubicSpline] = {}
@@ -145,7 +165,8 @@ class BodySimulation:
         out = []
         for name, effect in causes().items():
             on_ground = effect.on_grid == "ground" or name == "ground_height"
-            if name not in model.effects and name != "time_offset" and not (on_ground and taken):
+            free = effect.on_held and not len(self.experiments[0].body.heights)
+            if name not in model.effects and name != "time_offset" and not (on_ground and taken) and not free:
                 out.append(name)
         return out
 
@@ -165,6 +186,8 @@ class BodySimulation:
         lower, upper, step = p.lower, p.upper, p.step
         if p.unit == "kg":
             upper, step = min(upper, 30 * self.outline.mass), 0.05 * self.outline.mass
+        elif p.unit == "N":
+            step = 0.05 * self.outline.mass * float(np.linalg.norm(self.tracks.gravity))
         elif p.unit == "m":
             step = 0.04 * size
             if p.name in "xyz":  # a place is in the body or at it
@@ -213,11 +236,13 @@ class BodySimulation:
     def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
         """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
         both = {**self.known, **values}
+        lift = values.get(f"lift@{run.name}", 0.0)
         key = (
             run.name,
             float(run.times[-1]),
             model.effects,
             tuple(sorted((n, v) for n, v in both.items() if "@" not in n)),
+            *([lift] if lift else []),
         )
         if key in self.kept:
             return self.kept[key]
@@ -233,7 +258,7 @@ class BodySimulation:
             planned = self.planned(run, model, values, times)
             active = self.acting(run, model, values, last)
             self.rollouts += 1
-            state = run.body.released(planned.simulator.dtype)
+            state = run.body.released(planned.simulator.dtype, lift)
             law = self.law(model, values)
             positions = rollout(planned.simulator, law, state, planned.steps, planned.outputs, active)
         except (InputError, NonFiniteError):
@@ -269,26 +294,42 @@ class BodySimulation:
 
     def markers(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Markers (K, M, 3) [m, world] of the model at the run's times."""
-        path = self.path(run, model, values)
         names = [p.name for p in run.starts]
-        if run.fitted and all(name in values for name in names):
-            start = np.array([values[name] for name in names])
-        else:
-            start = self._start(run, path)
-        return path(np.clip(run.times - start[0], 0.0, None)) + start[1:] @ self.across
+        own = values if run.fitted and all(name in values for name in names) else self._start(run, model, values)
+        start = np.array([own[name] for name in names])
+        path = self.path(run, model, {**values, **own})
+        axes = self.across[: sum(not name.startswith(("release", "lift")) for name in names)]
+        return path(np.clip(run.times - start[0], 0.0, None)) + start[1 : 1 + len(axes)] @ axes
 
-    def _start(self, run: BodyRun, path: CubicSpline) -> np.ndarray:
-        """The values (3,) of ``run.starts`` that bring a held-out run nearest to its own motion (Gauss-Newton)."""
-        start, slope = np.zeros(3), path.derivative()
-        limits = np.array([p.upper for p in run.starts])
-        for _ in range(8):
-            at = np.clip(run.times - start[0], 0.0, None)
-            later = -slope(at) * (run.times > start[0])[:, None, None]
-            columns = [later, *(np.broadcast_to(axis, later.shape) for axis in self.across)]
-            off = path(at) + start[1:] @ self.across - run.observed
-            step = np.linalg.lstsq(np.stack([c.ravel() for c in columns], axis=1), -off.ravel(), rcond=None)[0]
-            start = np.clip(start + step, -limits, limits)
-        return start
+    def _start(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> dict[str, float]:
+        """The values of ``run.starts`` that bring a held-out run nearest to its own motion (Gauss-Newton).
+
+        The motion is nearly linear in the lift: its derivative comes from one more rollout, and a second pass is about
+        the lift of the first."""
+        starts = run.starts
+        start = np.zeros(len(starts))
+        limits = np.array([p.upper for p in starts])
+        lifts = [k for k, p in enumerate(starts) if p.name.startswith("lift")]
+        axes = self.across[: len(starts) - 1 - len(lifts)]
+        for _ in range(2 if lifts else 1):
+            about = {p.name: float(start[k]) for k, p in enumerate(starts)}
+            path = self.path(run, model, {**values, **about})
+            slope, bend, here = path.derivative(), None, start.copy()
+            for k in lifts:
+                nudged = float(start[k]) - starts[k].step * (1.0 if start[k] > 0 else -1.0)
+                other = self.path(run, model, {**values, **about, starts[k].name: nudged})
+                bend = CubicSpline(path.x, (other(path.x) - path(path.x)) / (nudged - start[k]))
+            for _ in range(8):
+                at = np.clip(run.times - start[0], 0.0, None)
+                later = -slope(at) * (run.times > start[0])[:, None, None]
+                columns = [later, *(np.broadcast_to(axis, later.shape) for axis in axes)]
+                off = path(at) + start[1 : 1 + len(axes)] @ axes - run.observed
+                if bend is not None:
+                    columns.append(bend(at))
+                    off += (start[-1] - here[-1]) * columns[-1]
+                step = np.linalg.lstsq(np.stack([c.ravel() for c in columns], axis=1), -off.ravel(), rcond=None)[0]
+                start = np.clip(start + step, -limits, limits)
+        return {p.name: float(start[k]) for k, p in enumerate(starts)}
 
     def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
         """Simulated less observed (K, M, 3) [m, world] of each run; of a held-out run nothing but on request."""
