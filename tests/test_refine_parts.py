@@ -11,8 +11,10 @@ import pytest
 from masiv.identify.parametric import Parameter
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
+from masiv.refine.loop import absent
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import best_strength, leapt, strengths_alone
+from masiv.refine.simulated import Term
 
 INSTANTS, ROWS, POINTS = 6, 4, 5
 NOISE = 1e-3
@@ -79,6 +81,16 @@ def test_a_strength_whose_effect_begins_late_is_found_by_trying():
     values, cost = best_strength(Kinked(np.eye(2), 0.0), None, {"a": 1.0, "b": 2.0}, strengths, soft=1e6)
     assert values == {"a": 1.0, "b": 8.0}
     assert cost == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_effect_begins_with_what_stood_for_it():
+    height = Parameter("ground_height.height", 0.0, -0.3, 0.3, 1e-3)
+    names = ("ground_offset@a", "ground_offset@b")
+    term = Term("ground_height", "ground_height", (height,), (), ((),), {}, stands_for=names)
+    start = absent(term, {"ground_offset@a": 0.02, "ground_offset@b": 0.03, "velocity_x@a": 1.0})
+    assert start == {"ground_height.height": 0.025, **dict.fromkeys(names, 0.0), "velocity_x@a": 1.0}
+    plain = Term("linear_drag", "linear_drag", (replace(height, name="linear_drag.rate"),), (), ((),), {})
+    assert absent(plain, {"velocity_x@a": 1.0}) == {"linear_drag.rate": 0.0, "velocity_x@a": 1.0}
 
 
 def test_what_a_fit_absorbs_is_no_uncertainty():
