@@ -93,6 +93,8 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
             break
         current = done.accepted.fitted
         rivals = [current]
+        if excess(current, experiments) < config.another:
+            break
     left, there_was = excess(current, experiments), excess(before, experiments)
     if current is not before and left > max(config.unexplained, there_was / 2):
         for done in rounds:  # no name for what it does not explain
