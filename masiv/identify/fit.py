@@ -13,7 +13,7 @@ import torch
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.problem import Motion, Problem
-from masiv.identify.silhouette import silhouette_error
+from masiv.identify.silhouette import discrepancy, silhouette_errors
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
@@ -23,12 +23,13 @@ FAILURES_ALLOWED = 8
 
 @dataclass
 class Fit:
-    """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; history: (iteration,
-    frames, trajectory error [m], silhouette error)."""
+    """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; discrepancy: what
+    the fit is chosen by; history: (iteration, frames, trajectory error [m], silhouette error)."""
 
     law: NeuralLaw | AdapterLaw
     motion: Motion
     error_m: float = math.inf
+    discrepancy: float = math.inf
     history: list[tuple[int, int, float, float]] = field(default_factory=list)
 
 
@@ -84,7 +85,8 @@ def fit(
             positions = problem.run(law, motion, contact, frames)
             error = problem.error(positions)
             silhouette = _silhouette(problem, positions, frames, seed, i)
-            loss = config.trajectory_weight * error / problem.size + config.silhouette_weight * silhouette
+            geometry = error if config.geometry_loss == "trajectory" else problem.geometry_error(positions)
+            loss = config.trajectory_weight * geometry / problem.size + config.silhouette_weight * silhouette
             loss.backward()
             if not all(torch.isfinite(p.grad).all() for p in parameters if p.grad is not None):
                 raise NonFiniteError(frames * problem.substeps(law), 0, "the adjoint overflowed")
@@ -99,8 +101,8 @@ def fit(
         failures = 0
         accepted = [p.detach().clone() for p in parameters]
         best.history.append((i, frames, float(error.detach()), float(silhouette.detach())))
-        if frames == problem.frames and float(error.detach()) < best.error_m:
-            best.error_m = float(error.detach())
+        if frames == problem.frames and (here := discrepancy(problem, positions)) < best.discrepancy:
+            best.discrepancy, best.error_m = here, float(error.detach())
             best.law = copy.deepcopy(law)
             best.motion = Motion(*(t.detach().clone() for t in motion.tensors()))
         for group in optimiser.param_groups:
@@ -123,16 +125,11 @@ def _silhouette(problem: Problem, positions: torch.Tensor, frames: int, seed: in
     if config.silhouette_pictures == 0 or config.silhouette_weight == 0:
         return torch.zeros(())
     random = np.random.default_rng((seed, iteration))
-    spacing = (problem.volume / problem.count) ** (1 / 3)
-    rotation = torch.as_tensor(problem.axes.rotation, dtype=torch.float32)
-    translation = torch.as_tensor(problem.axes.translation, dtype=torch.float32)
-    errors = []
+    pictures = []
     for _ in range(config.silhouette_pictures):
         frame = int(random.integers(1, frames + 1))
-        view = int(random.choice(scene.views))
-        world = (positions[frame * problem.samples - 1] - translation) @ rotation
-        errors.append(silhouette_error(scene, view, frame, world, spacing))
-    return torch.stack(errors).mean()
+        pictures.append((frame, int(random.choice(scene.views))))
+    return silhouette_errors(problem, positions, pictures)
 
 
 def _state(iteration, caution, failures, parameters, optimiser, best: Fit) -> dict:
@@ -145,6 +142,7 @@ def _state(iteration, caution, failures, parameters, optimiser, best: Fit) -> di
         "best_law": best.law.state_dict(),
         "best_motion": list(best.motion.tensors()),
         "best_error": best.error_m,
+        "best_discrepancy": best.discrepancy,
         "history": best.history,
     }
 
@@ -156,6 +154,6 @@ def _restore(state: dict, parameters, optimiser, best: Fit) -> tuple[int, float,
     optimiser.load_state_dict(state["optimiser"])
     best.law.load_state_dict(state["best_law"])
     best.motion = Motion(*state["best_motion"])
-    best.error_m = state["best_error"]
+    best.error_m, best.discrepancy = state["best_error"], state["best_discrepancy"]
     best.history = [tuple(row) for row in state["history"]]
     return state["iteration"], state["caution"], state["failures"]
