@@ -148,7 +148,7 @@ class Problem:
             gravity=self.gravity,
             contact=contact if self.scene.ground is not None else "none",
             memory_mb=self.simulator.memory_mb,
-            max_substeps=512,
+            max_substeps=1024,
             grid_nodes=self.simulator.grid_nodes,
             chunks=self.simulator.chunks,
         )
