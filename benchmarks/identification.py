@@ -7,28 +7,42 @@
 
 Law ``true`` is the family that made the scene. A scene is reconstructed once a seed and fitted with each law from the
 same trajectories. A case whose line is in OUT/results.jsonl is not run again; one that was killed goes on where it was.
-The truth is read by ``masiv evaluate`` alone, after the fit.
+The truth is read after the fit.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import itertools
 import json
 import shutil
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from identification_table import tables
 from parameters import FAMILY, true_parameters
 
-RUN = "from masiv.cli.main import run; run()"
-KEPT = ("gaussians.ply", "deformation.safetensors", "trajectory.npz", "log.csv")
+from masiv.cli import stages
+from masiv.identify.launch import estimate_launch
+from masiv.identify.stage import identify
+from masiv.metrics import chamfer_floor
+from masiv.mpm.design import grid_spacing
+from masiv.mpm.simulate import simulate
+from masiv.report.measure import motion_numbers, read_truth
+from masiv.report.numbers import twin_numbers
+from masiv.runfolder import RunFolder
+from masiv.scene.read import read_scene
+from masiv.scene.scene import Scene
+from masiv.twin import Twin
+
+KEPT = ("gaussians.ply", "deformation.safetensors", "trajectory.npz")
+PICTURES = ("psnr_db", "psnr_box_db", "psnr_box_in_scene_db", "ssim", "ssim_box", "mask_iou")
 
 
 @dataclass(frozen=True)
@@ -52,15 +66,10 @@ class Case:
         return "-".join([*parts, *self.settings]).replace("/", "_")
 
 
-def masiv(*arguments: str | Path) -> None:
-    """Run a command of masiv in a process of its own: what it takes is its own, too."""
-    subprocess.run([sys.executable, "-c", RUN, *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
-
-
-def overrides(settings: tuple[str, ...], path: Path) -> list[str | Path]:
-    """``--config`` with a file of ``settings``, or nothing."""
+def overrides(settings: tuple[str, ...], path: Path) -> Path | None:
+    """A configuration file of ``settings``, or None where there are none."""
     if not settings:
-        return []
+        return None
     nested: dict[str, Any] = {}
     for setting in settings:
         name, _, value = setting.partition("=")
@@ -71,40 +80,49 @@ def overrides(settings: tuple[str, ...], path: Path) -> list[str | Path]:
         inner[key] = yaml.safe_load(value)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(yaml.safe_dump(nested), encoding="utf-8")
-    return ["--config", path]
+    return path
 
 
 def base_run(case: Case, out: Path, preset: str, fit_frames: int) -> Path:
-    """The run with the scene's reconstruction and trajectories."""
+    """The run with the scene's reconstruction and trajectories, made now where it lacks them."""
     upstream = tuple(s for s in case.settings if s.startswith(("reconstruct.", "trajectory.")))
-    run = out / case.scene.name / "-".join(["base", f"seed{case.seed}", *upstream])
-    if not (run / "trajectory.npz").is_file():
-        config = overrides(upstream, out / "config.yaml")
-        masiv("reconstruct", case.scene, "--out", run, "--preset", preset, "--seed", str(case.seed),
-              "--fit-frames", str(fit_frames), *config)  # fmt: skip
-        masiv("trajectory", run)
-    return run
+    folder = out / case.scene.name / "-".join(["base", f"seed{case.seed}", *upstream])
+    if (folder / "run.yaml").is_file() and RunFolder.open(folder).done("trajectory"):
+        return folder
+    config = overrides(upstream, out / "config.yaml")
+    run, settings, scene = stages.open_run(
+        case.scene, folder, preset=preset, config=config, seed=case.seed, fit_frames=fit_frames
+    )
+    stages.estimated(run, settings, scene, said)
+    return folder
 
 
-def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> Path:
-    """The run of ``case``, from the trajectories of ``base``."""
-    run = out / case.scene.name / case.name
-    if not run.exists():
-        run.mkdir(parents=True)
+def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict[str, Any]:
+    """Fit ``case`` to the trajectories of ``base``; what is measured of it."""
+    folder = out / case.scene.name / case.name
+    if not (folder / "run.yaml").is_file():
+        folder.mkdir(parents=True, exist_ok=True)
         for name in KEPT:
-            if (base / name).exists():
-                shutil.copy(base / name, run / name)
+            shutil.copy(base / name, folder / name)
         record = yaml.safe_load((base / "run.yaml").read_text(encoding="utf-8"))
         record["stages"]["identify"] = {"state": "pending"}
-        (run / "run.yaml").write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
-    truth = material(case.scene)
-    law = FAMILY[truth["type"]] if case.law == "true" else case.law
-    extra: list[str | Path] = ["--geometry-loss", case.geometry_loss]
-    extra += [] if case.silhouette else ["--no-silhouette"]
-    masiv("identify", case.scene, "--out", run, "--preset", preset, "--seed", str(case.seed), "--law", law,
-          "--fit-frames", str(fit_frames), *extra, *overrides(case.settings, out / "config.yaml"))  # fmt: skip
-    masiv("evaluate", run, "--truth", case.scene / "gt")
-    return run
+        (folder / "run.yaml").write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
+    run, settings, scene = stages.open_run(
+        case.scene, folder, preset=preset, config=overrides(case.settings, out / "config.yaml"), seed=case.seed,
+        fit_frames=fit_frames, law=FAMILY[material(case.scene)["type"]] if case.law == "true" else case.law,
+        geometry_loss=case.geometry_loss, silhouette_weight=None if case.silhouette else 0.0,
+    )  # fmt: skip
+    stages.start(settings)
+    trajectory = stages.load_trajectory(run)
+    if not run.done("identify"):
+        with run.stage("identify") as checkpoint:
+            identify(
+                stages.fitted_scene(run, scene), trajectory, settings.identify, settings.simulator,
+                seed=settings.seed, checkpoint=checkpoint, progress=said,
+            ).save(run.path)  # fmt: skip
+    twin = Twin.load(run.path)
+    rollout = simulate(twin, frames=scene.frame_count, fps=scene.fps).positions
+    return measured(case, run, scene, twin, trajectory.positions, rollout)
 
 
 def material(scene: Path) -> dict[str, Any]:
@@ -112,60 +130,58 @@ def material(scene: Path) -> dict[str, Any]:
     return yaml.safe_load((scene / "truth.yaml").read_text(encoding="utf-8"))["material"]
 
 
-def measured(case: Case, run: Path) -> dict[str, Any]:
-    """The line of a finished case."""
-    evaluation = json.loads((run / "evaluate.json").read_text(encoding="utf-8"))
-    record = yaml.safe_load((run / "run.yaml").read_text(encoding="utf-8"))
-    twin = yaml.safe_load((run / "twin.yaml").read_text(encoding="utf-8"))
-    truth = material(case.scene)
-    law = twin["law"]
-    found = {}
+def measured(
+    case: Case, run: RunFolder, scene: Scene, twin: Twin, trajectory: np.ndarray, rollout: np.ndarray
+) -> dict[str, Any]:
+    """The line of a finished case. The truth is read here, after every fit."""
+    truth, points = material(case.scene), read_truth(case.scene / "gt", scene.frame_count)
+    law = twin.law.description()
     expected = true_parameters(truth) if law["kind"] == FAMILY[truth["type"]] else {}
-    for name, entry in law.get("parameters", {}).items():
-        found[name] = {**entry, "true": expected.get(name)}
-    pictures = ("psnr_db", "psnr_box_db", "psnr_box_in_scene_db", "ssim", "ssim_box", "mask_iou")
+    splits = {"observed": range(run.fit_frames), "future": range(run.fit_frames, scene.frame_count)}
+    seen = twin_numbers(run, scene, stages.load_dynamic(run), rollout)
     numbers = {}
-    for split in ("observed", "future"):
-        motion, seen = evaluation["motion"]["twin"][split], evaluation["twin"][split]
-        if motion is not None:
-            numbers[split] = {key: motion[key] for key in motion if key != "frames"}
-            numbers[split] |= {key: seen.get(key) for key in pictures} if seen else {}
+    for split, frames in splits.items():
+        pictures = seen[split] or {}
+        numbers[split] = {**motion_numbers(rollout, points, frames), **{key: pictures.get(key) for key in PICTURES}}
     return {
         "what": "fit", "scene": case.scene.name, "material": truth["type"], "law": case.law, "fitted": law["kind"],
         "seed": case.seed, "geometry_loss": case.geometry_loss, "silhouette": case.silhouette,
-        "settings": list(case.settings), "frames": [record["split"]["fit_frames"], evaluation["truth"]["frames"]],
-        "floor": evaluation["chamfer_floor_1e3mm2"], "trajectory": evaluation["motion"]["trajectory"]["observed"],
-        "rigid": evaluation["motion"].get("rigid, stops at the ground", {}).get("future"),
-        **numbers, "contact": twin["contact"], "parameters": found,
-        "fit_error_mm": twin["fit"]["trajectory_error_mm"], "start": twin["fit"].get("start"),
-        "families": [{k: v for k, v in row.items() if k != "parameters"} for row in twin["fit"].get("families", [])],
-        "seconds": {name: stage["seconds"] for name, stage in record["stages"].items() if "seconds" in stage},
+        "settings": list(case.settings), "frames": [run.fit_frames, len(points)],
+        "floor": floor(points), **numbers,
+        "trajectory": motion_numbers(trajectory, points, splits["observed"]), "contact": twin.contact,
+        "parameters": {n: {**entry, "true": expected.get(n)} for n, entry in law["parameters"].items()},
+        "fit_error_mm": twin.fit["trajectory_error_mm"], "start": twin.fit.get("start"),
+        "families": [{k: v for k, v in row.items() if k != "parameters"} for row in twin.fit.get("families", [])],
+        "seconds": run.seconds(),
     }  # fmt: skip
 
 
-def unseen(of: Path, other: Path, scene: Path) -> dict[str, Any]:
-    """The law of run ``of`` on the throw of run ``other``, whose frames give body, velocity and spin alone, these as
-    estimated from free flight: nothing after its first contact was seen. Ground and contact are those of ``of``."""
-    import dataclasses
+def said(stage: str, done: int, total: int, note: str = "") -> None:
+    """Progress, for a log."""
+    if done % max(1, total // 8) == 0:
+        print(f"  {stage} {done}/{total} {note}", file=sys.stderr, flush=True)
 
-    import numpy as np
 
-    from masiv import runtime
-    from masiv.mpm.simulate import simulate
-    from masiv.report.measure import motion_numbers, read_truth
-    from masiv.scene.read import read_scene
-    from masiv.twin import Twin
-
-    runtime.start("cpu")
-    learnt, body = Twin.load(of), Twin.load(other)
-    read = read_scene(scene)
+def unseen(twin: Twin, other: Path, scene: Path) -> dict[str, Any]:
+    """The law of ``twin`` on another throw, of which run ``other`` gives the body and, from its free flight alone, the
+    velocity and spin: no frame after the first contact is looked at. Ground and contact are those of ``twin``."""
+    run, read = RunFolder.open(other), read_scene(scene)
+    trajectory = stages.load_trajectory(run)
+    spacing = grid_spacing(trajectory.volume, trajectory.positions.shape[1], twin.simulator)
+    launch = estimate_launch(trajectory.positions, trajectory.times, read.gravity, read.ground, clearance=spacing)
     thrown = dataclasses.replace(
-        body, law=learnt.law, ground=learnt.ground, contact=learnt.contact, simulator=learnt.simulator,
-        velocity=np.array(body.fit["launch_velocity_m_per_s"]), omega=np.array(body.fit["launch_omega_rad_per_s"]),
+        twin, positions=trajectory.positions[0], volume=trajectory.volume, velocity=launch.velocity,
+        omega=launch.omega,
     )  # fmt: skip
-    motion = simulate(thrown, frames=read.frame_count, fps=read.fps)
+    motion = simulate(thrown, frames=read.frame_count, fps=read.fps).positions
     truth = read_truth(scene / "gt", read.frame_count)
-    return {"all frames": motion_numbers(motion.positions, truth, list(range(read.frame_count)))}
+    after = range(launch.last_frame + 1, read.frame_count)
+    return {"after contact": motion_numbers(motion, truth, after), "floor": floor(truth)}
+
+
+def floor(truth: np.ndarray) -> float:
+    """Chamfer of two samplings of the truth (T, P, 3), mean over frames [10^3 mm^2]."""
+    return float(np.mean([chamfer_floor(points) for points in truth]))
 
 
 def main() -> None:
@@ -188,23 +204,17 @@ def main() -> None:
     chosen = [] if o.table else itertools.product(o.scenes, o.seeds, o.laws, o.geometry_loss)
     for scene, seed, law, geometry_loss in chosen:
         case = Case(scene, law, seed, geometry_loss, not o.no_silhouette, tuple(o.set))
-        runs: dict[Path, Path] = {}
-        for where in (scene, *o.unseen):
-            here = Case(where, law, seed, geometry_loss, not o.no_silhouette, tuple(o.set))
-            key = f"{where.name}/{here.name}"
-            runs[where] = o.out / where.name / here.name
-            if key in done:
-                continue
+        key = f"{scene.name}/{case.name}"
+        if key not in done:
             began = time.monotonic()
-            base = base_run(here, o.out, o.preset, o.fit_frames)
-            line = {"case": key, "preset": o.preset, **measured(here, fit(here, base, o.out, o.preset, o.fit_frames))}
-            keep(results, rows, line)
-            done.add(key)
+            base = base_run(case, o.out, o.preset, o.fit_frames)
+            keep(results, rows, {"case": key, "preset": o.preset, **fit(case, base, o.out, o.preset, o.fit_frames)})
             print(f"{key}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
         for other in o.unseen:
             key = f"{scene.name}/{case.name} on {other.name}"
             if key not in done:
-                found = unseen(runs[scene], runs[other], other)
+                base = base_run(dataclasses.replace(case, scene=other), o.out, o.preset, o.fit_frames)
+                found = unseen(Twin.load(o.out / scene.name / case.name), base, other)
                 keep(results, rows, {"case": key, "what": "unseen", "scene": scene.name, "law": law, "on": other.name,
                                      "seed": seed, "settings": list(case.settings), **found})  # fmt: skip
     print(tables(rows))
