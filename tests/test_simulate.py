@@ -155,7 +155,8 @@ def test_a_blend_rolls_out_as_its_definition_and_between_its_ends():
 
     ends = [run(law) for law in (jelly, water)]
     np.testing.assert_allclose(run(BlendedLaw(jelly, water, 0.0)), ends[0], atol=2e-4)
-    height = [np.ptp(p[-1][:, 1]) for p in (*ends, run(blend(jelly, water, 0.5)))]
+    # The flattest that each gets: later they rebound, the softer the later.
+    height = [np.ptp(p[..., 1], axis=1).min() for p in (*ends, run(blend(jelly, water, 0.5)))]
     assert height[1] < height[2] < height[0]
     with pytest.raises(MasivError, match="no adjoint"):
         BlendedLaw(jelly, water, 0.5).bind(simulator().k, 8, 1e-3).backward(0, 8)

@@ -60,10 +60,7 @@ class BlendedLaw(Law):
 
     def log_rates(self, invariants: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Logarithms (N, 2) of the isochoric and volumetric flow rates [1/s]: of the blend, the first, the second."""
-        first, second = (
-            torch.log(-torch.log1p(-law.flow_share(invariants, SHORT))) - math.log(SHORT)
-            for law in (self.first, self.second)
-        )
+        first, second = (torch.log(law.flow(invariants, SHORT)) - math.log(SHORT) for law in (self.first, self.second))
         return (1 - self.weight) * first + self.weight * second, first, second
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 STRAIN_SCALE = 0.02
 LOG_MODULUS_RANGE = 6.0
-ALL_FLOWS = 30.0  # e^-30 of a strain is none
 LOG_RATE_RANGE = 14.0  # relaxation rates of e^-14 to e^14 per second
 
 
@@ -90,17 +89,21 @@ class NeuralLaw(Law):
 
     def flow_table(self, dt: float) -> torch.Tensor:
         """-ln of the shares of isochoric and volumetric strain that a substep of dt [s] keeps, at the nodes, (K, 2)."""
-        return table.gentle((dt * torch.exp(self.rate_table())).clamp_max(ALL_FLOWS))
+        return table.gentle(dt * torch.exp(self.rate_table()))
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
         """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
         value = table.interpolate(self.moduli_table(), self.features(invariants, STRAIN_SCALE))
         return torch.cat([torch.exp(value[:, :3]), value[:, 3:]], dim=1)
 
+    def flow(self, invariants: torch.Tensor, dt: float) -> torch.Tensor:
+        """-ln (N, 2) of the shares of isochoric and volumetric elastic strain that are left after dt [s]."""
+        features = self.features(invariants, torch.exp(self.log_flow_strain))
+        return table.interpolate(self.flow_table(dt), features)
+
     def flow_share(self, invariants: torch.Tensor, dt: float) -> torch.Tensor:
         """Shares (N, 2) of the isochoric and volumetric elastic strain that flow within dt [s]."""
-        features = self.features(invariants, torch.exp(self.log_flow_strain))
-        return -torch.expm1(-table.interpolate(self.flow_table(dt), features))
+        return -torch.expm1(-self.flow(invariants, dt))
 
     def project(self, trial_gradient: torch.Tensor, dt: float) -> torch.Tensor:
         share = self.flow_share(strain_invariants(trial_gradient), dt)
