@@ -103,7 +103,7 @@ def test_what_a_fit_absorbs_is_no_uncertainty():
 def fits(*levels, count=3):
     """As fitted: mean square distances, in units of the noise, over fitted and held-out instants."""
     squares = NOISE**2 * np.repeat(np.array(levels, dtype=float), [ROWS, INSTANTS - ROWS])
-    return SimpleNamespace(squares=[squares], parameters=[None] * count)
+    return SimpleNamespace(squares=[squares], parameters=[None] * count, values=dict.fromkeys(range(count)))
 
 
 def judged(before, after, sigma=NOISE, adapts=True):

@@ -56,14 +56,14 @@ def above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineCo
 
 
 def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched]) -> Fitted | None:
-    """Of fits, best first, the one with the fewest parameters that explains what the best one does, but for less than
-    noise and grid could change."""
+    """Of fits, best first, the one with the fewest parameters (those held at a guess included) that explains what the
+    best one does, but for less than noise and grid could change."""
 
     def lacks(fitted: Fitted) -> float:
         squares = zip(fitted.squares, passing[0].squares, experiments, strict=True)
         return phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments).largest
 
-    return min((f for f in passing if lacks(f) < SIMPLER), key=lambda f: len(f.parameters), default=None)
+    return min((f for f in passing if lacks(f) < SIMPLER), key=lambda f: len(f.values), default=None)
 
 
 def objections(

@@ -18,6 +18,7 @@ from masiv.refine.refit import (
     chord_fit,
     column,
     full_fit,
+    held_in,
     leapt,
     reweighted,
     robust_cost,
@@ -189,9 +190,9 @@ def _round(
         trial = next(t for t in trials if t.fitted is chosen)
         final = full_fit(
             simulation, trial.fitted.model, trial.fitted.values,
-            budget=2 * len(trial.fitted.parameters) + 6, soft=soft,
+            budget=2 * len(trial.fitted.parameters) + 6, soft=soft, held=held_in(simulation, trial.fitted),
         )  # fmt: skip
-        trial.fitted = min(final, trial.fitted, key=lambda f: f.cost)
+        trial.fitted = _freed(simulation, min(final, trial.fitted, key=lambda f: f.cost), soft)
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
@@ -218,7 +219,8 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
         budget = 2 * (len(trial.fitted.parameters) + 2)
         try:
             values = strengths_alone(simulation, trial.fitted.model, values, strengths, soft)
-            again = full_fit(simulation, trial.fitted.model, values, budget=budget, soft=soft)
+            held = held_in(simulation, trial.fitted)
+            again = full_fit(simulation, trial.fitted.model, values, budget=budget, soft=soft, held=held)
         except MasivError:
             continue
         trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
@@ -227,11 +229,13 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
 def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
     """``fitted`` as a start in another simulation of the same experiments."""
     budget = 4 * (len(fitted.parameters) + 1)
-    return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft)
+    held = held_in(simulation, fitted)
+    return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft, held=held)
 
 
 def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
-    """``base`` with the effect: strengths jointly with law and throw; then its places or frequencies as well."""
+    """``base`` with the effect: strengths jointly with law and throw; then its places or frequencies as well, where
+    the information criterion asks for it. Else they are as guessed, and without a standard error."""
     term = simulation.term(candidate.effect)
     model = base.model.with_effect(term.name)
     params = simulation.parameters(model)
@@ -249,24 +253,39 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
         theta = {p.name: candidate.theta[p.name] for p in term.parameters}
         jump, jumped = best_strength(simulation, model, {**base.values, **theta}, term.strengths, soft)
         if jumped < cost:
-            return full_fit(simulation, model, jump, budget=2 * len(params) + 6, soft=soft)
-    for _ in range(2 if others else 0):
+            return full_fit(
+                simulation, model, jump, budget=2 * len(first) + 6, soft=soft, held=frozenset(others)
+            )
+    if not others:
+        return summarised(simulation, model, params, values, jacobian, soft=soft)
+    guessed = summarised(simulation, model, first, values, jacobian, soft=soft)
+    for _ in range(2):
         extra = [p for p in params if p.name in others]
         wide = np.column_stack([jacobian, *[column(simulation, model, values, residual, p) for p in extra]])
         values, residual, wide = chord_fit(
             simulation, model, [*first, *extra], values, residual, wide, steps=CHORD_STEPS - 2, soft=soft
         )
         jacobian = wide[:, : len(first)]
-    if others:
-        order = [[*(p.name for p in first), *others].index(n) for n in names]
-        jacobian = wide[:, order]
-    return summarised(simulation, model, params, values, jacobian, soft=soft)
+    order = [[*(p.name for p in first), *others].index(n) for n in names]
+    placed = summarised(simulation, model, params, values, wide[:, order], soft=soft)
+    return ordered([guessed, placed])[0]
 
 
 def _assembled(first, base: Fitted, candidate: Candidate, strengths: list[str]) -> np.ndarray:
     known = {p.name: base.jacobian[:, k] for k, p in enumerate(base.parameters)}
     known |= {name: candidate.columns[:, k] for k, name in enumerate(strengths)}
     return np.stack([known[p.name] for p in first], axis=1)
+
+
+def _freed(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
+    """With what was left at a guess fitted as well, where the information criterion asks for it."""
+    if not held_in(simulation, fitted):
+        return fitted
+    budget = 3 * (len(fitted.values) + 1)
+    try:
+        return ordered([fitted, full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft)])[0]
+    except MasivError:
+        return fitted
 
 
 def _reasons(simulation: Simulated, before: Fitted, trial: Trial, config: RefineConfig) -> list[str]:

@@ -267,16 +267,31 @@ def summarised(
 
 
 def full_fit(
-    simulation: Simulated, model: Model, values: Mapping[str, float], *, budget: int, soft: float | None = None
+    simulation: Simulated,
+    model: Model,
+    values: Mapping[str, float],
+    *,
+    budget: int,
+    soft: float | None = None,
+    held: frozenset[str] = frozenset(),
 ) -> Fitted:
-    """Gauss-Newton with fresh derivatives from ``values`` (defaults where missing), and standard errors."""
-    params = started(simulation.parameters(model), values)
+    """Gauss-Newton with fresh derivatives from ``values`` (defaults where missing), and standard errors. held: names of
+    parameters that stay as they are."""
+    params = started([p for p in simulation.parameters(model) if p.name not in held], values)
+    still = {name: values[name] for name in held}
     estimate = fit_parameters(
-        lambda v: simulation.residual(model, v), params, max_evaluations=budget, robust=True, tolerance=LEAST_GAIN
-    )
+        lambda v: simulation.residual(model, {**still, **v}), params,
+        max_evaluations=budget, robust=True, tolerance=LEAST_GAIN,
+    )  # fmt: skip
     return summarised(
-        simulation, model, params, estimate.values, estimate.jacobian, soft=soft or softness(estimate.residual)
-    )
+        simulation, model, params, {**still, **estimate.values}, estimate.jacobian,
+        soft=soft or softness(estimate.residual),
+    )  # fmt: skip
+
+
+def held_in(simulation: Simulated, fitted: Fitted) -> frozenset[str]:
+    """Names of parameters of a model that ``fitted`` left as they were."""
+    return frozenset(p.name for p in simulation.parameters(fitted.model)) - {p.name for p in fitted.parameters}
 
 
 def started(params: Sequence[Parameter], values: Mapping[str, float]) -> tuple[Parameter, ...]:

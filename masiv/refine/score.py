@@ -17,6 +17,9 @@ from masiv.identify.parametric import robust_weight
 from masiv.refine.refit import Fitted
 from masiv.refine.simulated import Simulated, Term
 
+AS_MUCH = 0.02
+"""Difference of explained shares that is none."""
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -52,8 +55,18 @@ def score(
         tried = [_tried(simulation, base, term, guess, weight, nuisance, left) for guess in term.guesses]
         known = [t for t in tried if t is not None]
         if known:
-            found.append(max(known, key=lambda c: c.explained))
+            found.append(_least(known, term))
     return sorted(found, key=lambda c: -c.explained)
+
+
+def _least(tried: list[Candidate], term: Term) -> Candidate:
+    """Of guesses that explain as much as the best one, the one that takes least: much far in may look like little far
+    out, and then the data bounds a strength from below alone."""
+    best = max(c.explained for c in tried)
+    return min(
+        (c for c in tried if c.explained >= best - AS_MUCH),
+        key=lambda c: sum((c.theta[p.name] / p.step) ** 2 for p in term.strengths),
+    )
 
 
 def _tried(

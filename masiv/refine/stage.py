@@ -122,7 +122,7 @@ def twin_of(fitted: Fitted, throw: Throw, simulation: Simulation, old: Twin) -> 
         TwinEffect(
             name,
             {p.name.split(".")[1]: fitted.values[p.name] for p in effect_parameters(name)},
-            {p.name.split(".")[1]: _known(fitted.stderr[p.name]) for p in effect_parameters(name)},
+            {p.name.split(".")[1]: _known(fitted.stderr.get(p.name, math.inf)) for p in effect_parameters(name)},
         )
         for name in fitted.model.effects
     )

@@ -101,7 +101,7 @@ def _accepted(name: str, fitted: Fitted) -> dict[str, Any]:
     return {
         "effect": name,
         "theta": {short[p.name]: fitted.values[p.name] for p in own},
-        "stderr": {short[p.name]: fitted.stderr[p.name] for p in own},
+        "stderr": {short[p.name]: fitted.stderr.get(p.name) for p in own},
         "unit": {q.name: q.unit for q in effect_named(name).parameters},
     }
 
@@ -118,7 +118,7 @@ def _round(done: Round) -> dict[str, Any]:
                 "fit_rmse_mm": t.fitted.fit_mm,
                 "held_out_rmse_mm": t.fitted.held_out_mm,
                 "parameters": {
-                    p.name.split(".")[1]: {"value": t.fitted.values[p.name], "stderr": t.fitted.stderr[p.name]}
+                    p.name.split(".")[1]: {"value": t.fitted.values[p.name], "stderr": t.fitted.stderr.get(p.name)}
                     for p in effect_parameters(t.candidate.effect)
                 },
                 "information_gain": done.base.bic(t.fitted.samples) - t.fitted.bic(t.fitted.samples),
@@ -179,7 +179,7 @@ def text(document: dict[str, Any]) -> str:
                 f"  refit {r['effect']} ({r['law']}): {r['fit_rmse_mm']:.1f} mm{_held(r['held_out_rmse_mm'])}: {why}"
             )
     for a in document["accepted"]:
-        values = ", ".join(f"{n} {v:.4g} ± {a['stderr'][n]:.2g} {a['unit'][n]}" for n, v in a["theta"].items())
+        values = ", ".join(f"{n} {v:.4g}{_spread(a['stderr'][n])} {a['unit'][n]}" for n, v in a["theta"].items())
         lines.append(f"{a['effect']}: {values}")
     lines.append(
         f"before {before['fit']['trajectory_rmse_mm']:.1f} mm{_held(before['held_out'].get('trajectory_rmse_mm'))}, "
@@ -204,3 +204,7 @@ def _held(value: float | None) -> str:
 
 def _vector(quantity: dict[str, Any]) -> str:
     return "(" + ", ".join(f"{v:.1f}" for v in quantity["value"]) + ")"
+
+
+def _spread(error: float | None) -> str:
+    return "" if error is None else f" ± {error:.2g}"

@@ -118,7 +118,7 @@ def _accepted(found: Found, term: Term) -> dict[str, Any]:
         "effect": term.effect,
         "bodies": list(term.bodies),
         "theta": {_short(term, p.name): after.values[p.name] for p in term.parameters},
-        "stderr": {_short(term, p.name): after.stderr[p.name] for p in term.parameters},
+        "stderr": {_short(term, p.name): after.stderr.get(p.name) for p in term.parameters},
         "unit": {_short(term, p.name): term.units[p.name] for p in term.parameters},
     }
     if isinstance(found, Refined) and (place := place_of(found.simulation, term.name, after)) is not None:
@@ -137,7 +137,7 @@ def _round(found: Found, done: Round) -> dict[str, Any]:
             "fit_rmse_mm": t.fitted.fit_mm,
             "held_out_rmse_mm": t.fitted.held_out_mm,
             "parameters": {
-                _short(term, p.name): {"value": t.fitted.values[p.name], "stderr": t.fitted.stderr[p.name]}
+                _short(term, p.name): {"value": t.fitted.values[p.name], "stderr": t.fitted.stderr.get(p.name)}
                 for p in term.parameters
             },
             "information_gain": _gain(done.base, t.fitted),
