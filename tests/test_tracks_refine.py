@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from masiv.refine.config import RefineConfig
 from masiv.refine.loop import close_loop
 from masiv.refine.model import Model
 from masiv.refine.refit import full_fit
+from masiv.tracks.bent import across, bent
 from masiv.tracks.body import simulated_body, simulated_markers
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.fit import family_of, fit_law, simulation_of
@@ -128,6 +130,48 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     assert after.held_out_mm < 0.2 < 0.1 * outcome.before.held_out_mm
     share = {c.effect: c.explained for c in outcome.rounds[0].candidates}
     assert 1 - share["point_mass"] < 0.2 * (1 - share["gravity_scale"])
+
+
+def test_a_bent_start_strains_as_it_moves(bar):
+    """F is the gradient of the displacement, and a section turns without shear."""
+    run = next(r for r in bar.runs if r.name == "own_a")
+    body = simulated_body(bar, run, SIMULATOR, particle_spacing=5e-3)
+    x, gradient = bent(body, 2e-3)
+    before = body.particles
+    assert (x - before).norm(dim=1).max().item() == pytest.approx(2e-3, rel=0.15)
+    n, e = across(body)
+    depth = (before @ n).round(decimals=9)
+    layers = depth.unique()
+    one, two = (torch.nonzero(depth == layers[k])[:, 0] for k in (8, 9))
+    order = [
+        part[torch.argsort(before[part] @ e * 1e3 + before[part] @ torch.linalg.cross(n, e))] for part in (one, two)
+    ]
+    step = before[order[1]] - before[order[0]]
+    moved = x[order[1]] - x[order[0]]
+    mean = 0.5 * (gradient[order[0]] + gradient[order[1]])
+    torch.testing.assert_close((mean @ step[:, :, None])[:, :, 0], moved, rtol=0, atol=2e-7)
+    strain = 0.5 * (gradient + gradient.mT) - torch.eye(3, dtype=gradient.dtype)
+    along = torch.outer(n, n)
+    torch.testing.assert_close(strain, torch.einsum("kij,ij->k", strain, along)[:, None, None] * along)
+
+
+def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
+    known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
+    skipped = TRACKS.model_copy(update={"skip": 0.05})
+    simulation = simulation_of(bar, "", skipped, SIMULATOR, known=known)
+    run = next(r for r in simulation.experiments if not r.fitted)
+    assert run.times[0] >= 0.05
+    model = Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",))
+    truth = {"release": 3e-3, "aside_1": 4e-4, "aside_2": -3e-4, "above": 1e-3, "lift": -4e-3}
+    named = {f"{name}@{run.name}": value for name, value in truth.items()}
+    assert {p.name for p in run.starts} == set(named)
+    seen = simulation.markers(replace(run, fitted=True), model, named)
+    plain = simulation.markers(replace(run, fitted=True), model, dict.fromkeys(named, 0.0))
+    assert np.abs(seen - plain).max() > 2e-3
+    found = simulation._start(replace(run, observed=seen), model, {})
+    for name, value in named.items():
+        step = next(p.step for p in run.starts if p.name == name)
+        assert found[name] == pytest.approx(value, abs=0.2 * step), name
 
 
 @pytest.fixture

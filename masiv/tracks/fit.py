@@ -83,10 +83,18 @@ def family_of(kind: str, density: float, known: dict[str, float]) -> Family:
 
 def fit_law(simulation: BodySimulation, family: Family, config: TracksConfig, progress: Progress) -> Fitted:
     """``family`` fitted to the fitted runs: its scale by a search over the first moments, then all its parameters
-    over ever more of the motion. Raises MasivError where every law diverges."""
+    over ever more of the motion. Where the first moments are to be left out, that is done with them first: they have
+    the phase from which the rest is counted. Raises MasivError where every law diverges."""
     contact = "sticky" if simulation.ground else "none"
     model = Model(family, contact)
-    horizon, last = config.skip + config.search_duration, max(float(run.times[-1]) for run in simulation.experiments)
+    if config.skip:
+        whole = config.model_copy(update={"skip": 0.0})
+        started = simulation_of(
+            simulation.tracks, simulation.experiments[0].condition, whole, simulation.config,
+            known=simulation.known, folder=simulation.folder,
+        )  # fmt: skip
+        return full_fit(simulation, model, fit_law(started, family, whole, progress).values, budget=config.rollouts)
+    horizon, last = config.search_duration, max(float(run.times[-1]) for run in simulation.experiments)
     values = _searched(_cut(simulation, horizon), model, progress)
     while True:
         horizon = min(2 * horizon, last)
