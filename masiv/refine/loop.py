@@ -253,9 +253,9 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
         theta = {p.name: candidate.theta[p.name] for p in term.parameters}
         jump, jumped = best_strength(simulation, model, {**base.values, **theta}, term.strengths, soft)
         if jumped < cost:
-            return full_fit(
-                simulation, model, jump, budget=2 * len(first) + 6, soft=soft, held=frozenset(others)
-            )
+            budget = 2 * len(first) + 6
+            leap = full_fit(simulation, model, jump, budget=budget, soft=soft, held=frozenset(others))
+            return _freed(simulation, leap, soft)
     if not others:
         return summarised(simulation, model, params, values, jacobian, soft=soft)
     guessed = summarised(simulation, model, first, values, jacobian, soft=soft)
