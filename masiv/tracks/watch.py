@@ -94,7 +94,7 @@ def body_run(
     """``run`` from ``skip`` to ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises
     InputError."""
     if not skip < duration:
-        raise InputError(f"tracks.skip {skip:g} s leaves nothing of tracks.duration {duration:g} s")
+        raise InputError(f"run {run.name}: unsteady: {skip:g} s leaves nothing of tracks.duration {duration:g} s")
     if run.release is None:
         raise InputError(f"{tracks.path}: run {run.name}: nobody knows when it was let go: give rest_frames")
     body = simulated_body(tracks, run, config, particle_spacing=spacing)
@@ -369,6 +369,6 @@ LAW_NAMES = frozenset({"youngs_modulus", "poissons_ratio", "yield_stress", "fric
 
 
 def shortened(run: BodyRun, duration: float) -> BodyRun:
-    """The first ``duration`` [s] of a run."""
-    kept = run.times <= duration
+    """The first ``duration`` [s] of what is compared of a run."""
+    kept = run.times <= run.skip + duration
     return replace(run, times=run.times[kept], observed=run.observed[kept], sigma=run.sigma[kept])
