@@ -55,17 +55,18 @@ def simulation_of(
     if body.geometry is None:
         raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass, to be simulated")
 
-    def made(particles: int) -> list[BodyRun]:
+    def made(particles: int, whole: bool) -> list[BodyRun]:
         spacing = (body.geometry.volume / particles) ** (1 / 3)
         return [
             body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.unsteady)
             for run in runs_of(tracks, condition)
         ]
 
-    runs = made(config.particles)
+    runs = made(config.particles, whole)
+    entire = made(config.particles, True) if any(run.skip for run in runs) else ()
     last = max(float(run.times[-1]) for run in runs)
     horizons = [h for k in range(16) if (h := config.search_duration * 2**k) < 0.9 * last]
-    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder)
+    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder, whole=entire)
 
 
 def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:

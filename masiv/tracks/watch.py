@@ -127,9 +127,11 @@ class BodySimulation:
         known: Mapping[str, float] | None = None,
         horizons: Sequence[float] = (),
         folder: Path | None = None,
+        whole: Sequence[BodyRun] = (),
     ) -> None:
-        """runs: see ``body_run``; horizons [s]:
-        after which a search may stop to look; folder: where rollouts are kept, which are many and long."""
+        """runs: see ``body_run``; horizons [s]: after which a search may stop to look; folder: where rollouts are kept,
+        which are many and long; whole: the runs with the moments that they leave out, where they do."""
+        self.whole: Sequence[BodyRun] = tuple(whole)
         self.horizons = tuple(horizons)
         self.folder = folder
         self.tracks = tracks
@@ -236,7 +238,7 @@ class BodySimulation:
     def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
         """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
         both = {**self.known, **values}
-        lift = values.get(f"lift@{run.name}", 0.0)
+        lift = values.get(f"lift@{run.name}", 0.0) if run.skip else 0.0
         key = (
             run.name,
             float(run.times[-1]),
@@ -350,11 +352,14 @@ class BodySimulation:
         return None
 
     def early(self, base: Fitted) -> Sequence[BodySimulation]:
-        """The first moments, then ever more, where the residual is as large as the swing: then the phase is lost."""
+        """The first moments, then ever more, where the residual is as large as the swing: then the phase is lost.
+
+        Those that are left out are in it, unsteady as they are: the phase counts from there, and an effective start
+        would make up for any frequency."""
         swing = [run.observed - run.observed.mean(0) for run in self.experiments if run.fitted]
         if base.fit_mm < LOST * rms_mm(swing):
             return ()
-        runs = [run for run in self.experiments if run.fitted]
+        runs = [run for run in self.whole or self.experiments if run.fitted]
         return [self.over([shortened(run, horizon) for run in runs]) for horizon in self.horizons]
 
     def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
