@@ -10,9 +10,11 @@ import pytest
 
 from masiv.identify.parametric import Parameter
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import excess, explains_too_little, simplest
+from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
+from masiv.refine.loop import absent
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import best_strength, leapt, strengths_alone
+from masiv.refine.simulated import Term
 
 INSTANTS, ROWS, POINTS = 6, 4, 5
 NOISE = 1e-3
@@ -81,6 +83,16 @@ def test_a_strength_whose_effect_begins_late_is_found_by_trying():
     assert cost == pytest.approx(0.0, abs=1e-9)
 
 
+def test_an_effect_begins_with_what_stood_for_it():
+    height = Parameter("ground_height.height", 0.0, -0.3, 0.3, 1e-3)
+    names = ("ground_offset@a", "ground_offset@b")
+    term = Term("ground_height", "ground_height", (height,), (), ((),), {}, stands_for=names)
+    start = absent(term, {"ground_offset@a": 0.02, "ground_offset@b": 0.03, "velocity_x@a": 1.0})
+    assert start == {"ground_height.height": 0.025, **dict.fromkeys(names, 0.0), "velocity_x@a": 1.0}
+    plain = Term("linear_drag", "linear_drag", (replace(height, name="linear_drag.rate"),), (), ((),), {})
+    assert absent(plain, {"velocity_x@a": 1.0}) == {"linear_drag.rate": 0.0, "velocity_x@a": 1.0}
+
+
 def test_what_a_fit_absorbs_is_no_uncertainty():
     random = np.random.default_rng(2)
     jacobian = random.normal(size=(ROWS * POINTS * 3, 2))
@@ -125,6 +137,25 @@ def test_evidence():
     assert "held-out" in judged(fits(1.6, 2.0), fits(1.2, 2.0), adapts=False)[-1]
     # Nothing is plain where the simulation is nowhere as certain as the observation.
     assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]
+
+
+def test_a_strength_counts_with_its_place_held():
+    random = np.random.default_rng(4)
+    along, throw, apart = random.normal(size=(3, 40))
+    strength, place = (Parameter(f"mass.{n}", 0.0, -9.0, 9.0, 1e-3) for n in ("size", "x"))
+    other = Parameter("throw", 0.0, -9.0, 9.0, 1e-3)
+    term = SimpleNamespace(strengths=(strength,), others=(place,))
+    # The place does nearly what the strength does: its standard error alone is large.
+    jacobian = np.stack([throw, along, along + 0.1 * apart], axis=1)
+    stderr = 0.2 * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    names = ("throw", strength.name, place.name)
+    fitted = SimpleNamespace(
+        jacobian=jacobian, parameters=(other, strength, place),
+        values=dict.fromkeys(names, 0.5), stderr=dict(zip(names, stderr, strict=True)),
+    )  # fmt: skip
+    alone = 0.2 * np.sqrt(np.linalg.inv(jacobian[:, :2].T @ jacobian[:, :2])[1, 1])
+    assert 0.5 / stderr[1] < 4
+    assert sigmas_from_zero(fitted, term) == pytest.approx(0.5 / alone, rel=1e-6)
 
 
 def test_of_causes_that_explain_as_much_thesimplest():

@@ -70,6 +70,9 @@ class Effect(ABC):
     on_held: ClassVar[bool] = False
     """Whether it acts on a body that is held somewhere: on a free one it is nothing but another effect."""
 
+    stands_for: ClassVar[str | None] = None
+    """What of every throw is fitted for want of this effect, and no longer beside it."""
+
     of_body: ClassVar[bool] = False
     """Whether the strength depends on the body (a drag), so that bodies may differ; else it is that of the
     surroundings, one for all that move in them."""

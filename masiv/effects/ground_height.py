@@ -6,11 +6,13 @@ from masiv.effects.effect import Effect, EffectParameter
 
 
 class GroundHeight(Effect):
-    """The ground is at y = theta instead of y = 0."""
+    """The ground is at y = theta instead of y = 0: by more than the few centimetres that are fitted anyway, since no
+    floor is known to the millimetre."""
 
     name = "ground_height"
     looks_like = "contact begins early or late, and the body rests too high or too low"
     parameters = (EffectParameter("height", "m", -0.3, 0.3, 0.001),)
+    stands_for = "ground_offset"
 
     def ground_shift(self, theta):
         return theta[0]

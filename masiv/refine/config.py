@@ -20,6 +20,9 @@ class RefineConfig(BaseModel):
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
     above_noise: float = Field(1.2, ge=0, description="residual over the noise below which nothing is looked for")
+    another: float = Field(
+        2.0, ge=0, description="residual over what noise and grid explain below which no further effect is looked for"
+    )
     tracking_error: float = Field(
         0.4, ge=0, le=1,
         description="how far points that are followed in pictures are off, over how far they left a rigid motion",

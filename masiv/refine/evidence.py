@@ -76,13 +76,33 @@ def objections(
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
     adapts = bool(term.others) or gain < 2 * config.least_bic
     out += explains_too_little(before, after, experiments, config, adapts=adapts)
-    sigmas = math.sqrt(sum((after.values[p.name] / after.stderr[p.name]) ** 2 for p in term.strengths))
+    sigmas = sigmas_from_zero(after, term)
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
     for p in term.parameters:
         if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper):
             out.append(f"{p.name} runs into the bound of what is possible, {p.upper:g}")
     return out
+
+
+def sigmas_from_zero(fitted: Fitted, term: Term) -> float:
+    """How many standard errors the strength of ``term`` is from none, its places and frequencies held where they are.
+
+    A strength and a place may make up for each other (a lighter mass farther out), so that neither is well known
+    while it is plain that something is there. ``Fitted.stderr`` is of each with all else free.
+    """
+    held = {p.name for p in term.others}
+    lengths = np.maximum(np.linalg.norm(fitted.jacobian, axis=0), 1e-300)
+    unit = fitted.jacobian / lengths
+    names = [p.name for p in fitted.parameters]
+    kept = [k for k, name in enumerate(names) if name not in held]
+    free, fixed = (np.diag(np.linalg.pinv(a.T @ a, hermitian=True)) for a in (unit, unit[:, kept]))
+    total = 0.0
+    for p in term.strengths:
+        k = names.index(p.name)
+        known = math.sqrt(fixed[kept.index(k)] / free[k]) if free[k] > 0 else 1.0
+        total += (fitted.values[p.name] / (fitted.stderr[p.name] * known)) ** 2
+    return math.sqrt(total)
 
 
 def explains_too_little(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from masiv.refine.refit import (
     summarised,
 )
 from masiv.refine.score import Candidate, alike, score
-from masiv.refine.simulated import Simulated
+from masiv.refine.simulated import Simulated, Term
 
 Say = Callable[[str, int, int, str], None]
 CHORD_STEPS = 8
@@ -94,6 +94,8 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
             break
         current = done.accepted.fitted
         rivals = [current]
+        if excess(current, experiments) < config.another:
+            break
     left, there_was = excess(current, experiments), excess(before, experiments)
     if current is not before and left > max(config.unexplained, there_was / 2):
         for done in rounds:  # no name for what it does not explain
@@ -243,19 +245,19 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
     first = [p for p in params if p not in term.others]
     jacobian = _assembled(first, base, candidate, [p.name for p in term.strengths])
     others = {p.name: candidate.theta[p.name] for p in term.others}
-    values = {**base.values, **{p.name: 0.0 for p in term.strengths}, **others}
-    values, residual, jacobian = leapt(simulation, model, first, values, base.residual, jacobian, soft=soft)
+    values = {**absent(term, base.values), **others}
+    residual = simulation.residual(model, values) if term.stands_for else base.residual
+    values, residual, jacobian = leapt(simulation, model, first, values, residual, jacobian, soft=soft)
     values, residual, jacobian = chord_fit(
         simulation, model, first, values, residual, jacobian, steps=CHORD_STEPS, soft=soft
     )
     cost = robust_cost(residual, soft)
     if base.cost - cost < 0.5 * candidate.explained * base.cost:  # far from the promise: not linear about zero
-        theta = {p.name: candidate.theta[p.name] for p in term.parameters}
-        jump, jumped = best_strength(simulation, model, {**base.values, **theta}, term.strengths, soft)
+        start = {**absent(term, base.values), **others}
+        start |= {p.name: start[p.name] + candidate.theta[p.name] for p in term.strengths}
+        jump, jumped = best_strength(simulation, model, start, term.strengths, soft)
         if jumped < cost:
-            budget = 2 * len(first) + 6
-            leap = full_fit(simulation, model, jump, budget=budget, soft=soft, held=frozenset(others))
-            return _freed(simulation, leap, soft)
+            return full_fit(simulation, model, jump, budget=2 * len(params) + 6, soft=soft)
     if not others:
         return summarised(simulation, model, params, values, jacobian, soft=soft)
     guessed = summarised(simulation, model, first, values, jacobian, soft=soft)
@@ -269,6 +271,16 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
     order = [[*(p.name for p in first), *others].index(n) for n in names]
     placed = summarised(simulation, model, params, values, wide[:, order], soft=soft)
     return ordered([guessed, placed])[0]
+
+
+def absent(term: Term, values: Mapping[str, float]) -> dict[str, float]:
+    """``values`` for a model with ``term`` that moves as the one without did: no strength, or that of what it stands
+    for."""
+    out = {**values, **{p.name: 0.0 for p in term.strengths}}
+    known = [values[name] for name in term.stands_for if name in values]
+    if known:
+        out[term.strengths[0].name] = sum(known) / len(known)
+    return out | dict.fromkeys(term.stands_for, 0.0)
 
 
 def _assembled(first, base: Fitted, candidate: Candidate, strengths: list[str]) -> np.ndarray:

@@ -68,7 +68,13 @@ class Model:
 
 def parameters(model: Model, experiments: Sequence[Experiment]) -> tuple[Parameter, ...]:
     """What is fitted: law and effects, shared by all experiments, and each one's throw, named ``name@experiment``."""
-    own = [replace(p, name=f"{p.name}@{e.name}") for e in experiments for p in motion_parameters(e.problem, e.motion)]
+    gone = {effect_named(name).stands_for for name in model.effects}
+    own = [
+        replace(p, name=f"{p.name}@{e.name}")
+        for e in experiments
+        for p in motion_parameters(e.problem, e.motion)
+        if p.name not in gone
+    ]
     return (*model.family.parameters, *own, *(p for name in model.effects for p in effect_parameters(name)))
 
 
@@ -119,7 +125,11 @@ class Simulation:
 
     def term(self, name: str) -> Term:
         """The effect, of all that is filmed; its guesses are of the first experiment."""
-        return plain_term(name, self.experiments[0].problem.setting())
+        term = plain_term(name, self.experiments[0].problem.setting())
+        instead = effect_named(name).stands_for
+        return replace(
+            term, stands_for=() if instead is None else tuple(f"{instead}@{e.name}" for e in self.experiments)
+        )
 
     def early(self, base) -> list:
         """None: a fall is short."""

@@ -120,7 +120,7 @@ def chord_fit(
         weight = robust_weight(residual, soft)
         a = (jacobian * scale) * weight[:, None]
         normal, right = a.T @ a, a.T @ (-residual * weight)
-        free = _free(params, values, right)
+        free = free_parameters(params, values, right)
         step = np.zeros(len(params))
         inner = normal[np.ix_(free, free)]
         step[free] = np.linalg.lstsq(inner + damping * np.diag(np.diag(inner)), right[free], rcond=1e-10)[0]
@@ -224,7 +224,7 @@ def reweighted(simulation: Simulated, base: Fitted, *, steps: int, soft: float) 
     return summarised(simulation, base.model, params, values, jacobian, soft=soft)
 
 
-def _free(params: Sequence[Parameter], values: Mapping[str, float], downhill: np.ndarray) -> np.ndarray:
+def free_parameters(params: Sequence[Parameter], values: Mapping[str, float], downhill: np.ndarray) -> np.ndarray:
     """Indices of parameters that are not held at a bound which the descent would cross."""
     out = []
     for k, p in enumerate(params):

@@ -14,7 +14,7 @@ import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.identify.parametric import robust_weight
-from masiv.refine.refit import Fitted
+from masiv.refine.refit import Fitted, free_parameters
 from masiv.refine.simulated import Simulated, Term
 
 AS_MUCH = 0.02
@@ -44,7 +44,10 @@ def score(
 ) -> list[Candidate]:
     """Every cause that ``base`` lacks, best explained first. names: only these, of all effects."""
     weight = robust_weight(base.residual, soft)
-    nuisance = _basis(base.jacobian * weight[:, None])
+    weighted = base.jacobian * weight[:, None]
+    # What is held at a bound that the descent would cross absorbs nothing more.
+    free = free_parameters(base.parameters, base.values, -weighted.T @ (base.residual * weight))
+    nuisance = _basis(weighted[:, free])
     left = _without(nuisance, base.residual * weight)
     found = []
     todo = [n for n in (names or simulation.candidates(base.model)) if n not in base.model.effects]

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 class Term:
     """An effect as it may be added to a model. name: that of the effect, followed by whom it acts on where that is not
     everything; strengths: parameters that are zero where it is absent; others: its places, frequencies…; guesses:
-    values of the others to try in the score test; units by parameter; bodies: whom it acts on (none: everything)."""
+    values of the others to try in the score test; units by parameter; bodies: whom it acts on (none: everything);
+    stands_for: parameters of a model without it that it makes superfluous."""
 
     name: str
     effect: str
@@ -33,6 +34,7 @@ class Term:
     guesses: tuple[tuple[float, ...], ...]
     units: dict[str, str]
     bodies: tuple[str, ...] = ()
+    stands_for: tuple[str, ...] = ()
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
