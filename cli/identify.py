@@ -31,6 +31,17 @@ def identify(
             "[default: neural]",
         ),
     ] = None,
+    geometry_loss: Annotated[
+        str | None,
+        typer.Option(
+            "--geometry-loss",
+            help="What a neural law is fitted to: trajectory (paths of particles), continuum (bodies frame by frame), "
+            "surface, or none (silhouettes alone). [default: trajectory]",
+        ),
+    ] = None,
+    no_silhouette: Annotated[
+        bool, typer.Option("--no-silhouette", help="Fit a neural law without silhouettes.")
+    ] = False,
     fit_frames: FitFramesOption = None,
     holdout: HoldoutOption = None,
     config: ConfigOption = None,
@@ -51,7 +62,9 @@ def identify(
     from .console import progress_bar
 
     if tracked.is_scene(scene):
-        tracked.refused(fit_frames=fit_frames, holdout_camera=holdout)
+        tracked.refused(
+            fit_frames=fit_frames, holdout_camera=holdout, geometry_loss=geometry_loss, no_silhouette=no_silhouette
+        )
         folder = out or Path("runs") / scene.resolve().name
         opened = tracked.open_run(scene, folder, preset=preset, config=config, seed=seed, arch=arch, law=law)
         return tracked.identify(*opened)
@@ -65,6 +78,8 @@ def identify(
         fit_frames=fit_frames,
         holdout=holdout,
         law=law,
+        geometry_loss=geometry_loss,
+        silhouette_weight=0.0 if no_silhouette else None,
     )
     stages.start(settings)
     from masiv.mpm.simulate import simulate

@@ -37,14 +37,16 @@ def open_run(
     arch: str | None = None,
     fit_frames: int | None = None,
     holdout: list[int] | None = None,
-    law: str | None = None,
+    **identify: str | float | None,
 ) -> tuple[RunFolder, Config, Scene]:
     """The run in ``out``, new or resumed, its configuration and the whole scene. What is not given is as in the run.
 
+    identify: keys of that section of the configuration.
     Everything is checked before the folder is made. Raises InputError.
     """
     existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
-    flags: dict[str, int | str | None] = {"seed": seed, "arch": arch, "identify.law": law}
+    flags: dict[str, int | float | str | None] = {"seed": seed, "arch": arch}
+    flags |= {f"identify.{key}": value for key, value in identify.items()}
     settings = load_config(preset, config, existing.config if existing else None, **flags)
     scene = read_scene(scene_path)
     if fit_frames is None:

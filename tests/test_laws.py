@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
+from masiv.materials import table
 from masiv.materials.classical import DIFFERENTIABLE, PARAMETERS, ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw, strain_invariants
@@ -81,6 +82,51 @@ def test_flow_does_not_depend_on_the_substep():
     halves = law.project(law.project(f, 1e-4), 1e-4)
     moved = (whole - f).detach().abs().max()
     assert float((whole - halves).detach().abs().max()) < 1e-3 * float(moved)
+
+
+def yielding(shear_strain=0.05):
+    """A neural law whose rate rises by e^30 within a feature's unit around a strain: a yield stress."""
+    law = NeuralLaw(stress_scale=1e4, seed=0).double()
+    nodes = table.nodes(F64)
+    rates = (30.0 * (nodes[:, 1] - math.log(2 * shear_strain / 0.02))).clamp(-14, 14)
+    law.rate_table = lambda: torch.stack([rates, torch.full_like(rates, -14.0)], dim=1)
+    return law
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_more_strain_never_leaves_less_of_it(seed):
+    """What a substep keeps of a pure shear rises with the shear, however steep the rates are."""
+    shear = torch.linspace(1e-4, 0.4, 400, dtype=F64)
+    f = torch.diag_embed(torch.exp(torch.stack([shear, torch.zeros_like(shear), -shear], dim=1)))
+    for law in (rough(seed), yielding(0.001 + 0.1 * (seed % 10))):
+        kept = shear * (1 - law.flow_share(strain_invariants(f), 1e-3)[:, 0].detach())
+        # The feature is the strain's logarithm to second order: at a strain of 0.4 its slope is 5 % above 1.
+        assert float((kept.diff() / shear.diff()).min()) > -0.1
+
+
+def test_a_steep_rate_is_perfect_plasticity():
+    shear = torch.linspace(0.001, 0.4, 400, dtype=F64)
+    f = torch.diag_embed(torch.exp(torch.stack([shear, torch.zeros_like(shear), -shear], dim=1)))
+    kept = shear * (1 - yielding(0.05).flow_share(strain_invariants(f), 1e-3)[:, 0].detach())
+    elastic, beyond = shear < 0.03, shear > 0.1
+    torch.testing.assert_close(kept[elastic], shear[elastic], rtol=1e-3, atol=0)
+    assert 0.03 < float(kept[beyond].min()) < float(kept[beyond].max()) < 1.1 * float(kept[beyond].min())
+
+
+def test_gentle_is_the_largest_gentle_table_below():
+    shape = (*table.COUNTS, 1)
+    values = 5 * torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=F64)
+    values[20, 10, 4] = 0.0
+    out = table.gentle(values.reshape(-1, 1)).reshape(shape)
+    assert (out <= values).all()
+    for axis in range(3):
+        assert float(out.diff(dim=axis).abs().max()) <= table.STEP + table.ROUNDING
+    i, j, k = 22, 9, 7
+    cone = sum(abs(a - b) for a, b in zip((i, j, k), (20, 10, 4), strict=True)) * table.STEP
+    assert float(out[i, j, k]) <= cone + 1e-12
+    tiny = torch.full((math.prod(table.COUNTS), 1), 1e-9)
+    assert torch.equal(table.gentle(tiny), tiny)
 
 
 def test_relaxation_removes_strain_and_keeps_volume():
@@ -277,8 +323,9 @@ def test_pretrained_law_resembles_its_material(material, squeeze):
             f = each.project(step @ f, 5e-4)
         states.append(each.stress(f)[0].detach())
     pressures = [float(stress.trace()) for stress in states]
-    assert pressures[1] == pytest.approx(pressures[0], rel=0.06)
-    if material != "sand":  # its friction is not learnt from one throw, only that it bears pressure and no tension
+    # The friction of sand is not learnt from one throw, only that it bears pressure and no tension.
+    assert pressures[1] == pytest.approx(pressures[0], rel=0.15 if material == "sand" else 0.06)
+    if material != "sand":
         assert float((states[0] - states[1]).norm() / states[0].norm()) < 0.05
 
 

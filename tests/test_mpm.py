@@ -7,8 +7,11 @@ import pytest
 import torch
 
 from masiv.errors import NonFiniteError
+from masiv.identify.start import with_scales
 from masiv.materials.classical import ClassicalLaw
+from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
+from masiv.materials.pretrain import pretrained_path
 from masiv.mpm._reference import _substep
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulate import thrown
@@ -144,6 +147,22 @@ def test_rollout_gradient_by_finite_differences(height, steps):
             low = float(loss())
             leaf[index] = value
             assert float(gradient[index]) == pytest.approx((high - low) / (2 * step), rel=2e-4)
+
+
+def test_the_adjoint_of_a_yielding_body_does_not_grow():
+    """A rate taken from the strain before a substep made it grow by a factor each: 1e36 within 500 substeps."""
+    law = load_law(pretrained_path("plasticine"))
+    sim = Simulator(
+        particle_count=343, spacing=0.08, substep=6e-4, volume=0.064, density=1000.0, gravity=(0.0, -9.8, 0.0),
+    )  # fmt: skip
+    axis = 0.4 * (torch.arange(7) + 0.5) / 7
+    x = torch.stack(torch.meshgrid(axis, axis + 0.05, axis, indexing="ij"), -1).reshape(-1, 3)
+    velocity = torch.tensor([0.3, -3.0, 0.0], requires_grad=True)
+    soft = with_scales(law, 5e4, 1.0)
+    path = rollout(sim, soft, at_rest(x, velocity.expand(343, 3), torch.zeros(343, 3, 3)), 400, [400])[0]
+    (gradient,) = torch.autograd.grad(path.mean(0)[0], [velocity])
+    duration = 400 * 6e-4
+    assert float(gradient.norm()) < 3 * duration
 
 
 def test_rollout_is_bit_reproducible_and_segments_do_not_change_it():

@@ -37,6 +37,11 @@ class IdentifyConfig(BaseModel):
     velocity_learning_rate: float = Field(0.01, gt=0, description="step of velocity [m/s] and spin [rad/s]")
     ground_learning_rate: float = Field(1e-3, gt=0, description="step of the ground's height [m]")
     ground_range: float = Field(0.03, ge=0, description="the effective ground may lie this far from the scene's [m]")
-    trajectory_weight: float = Field(1.0, ge=0)
+    geometry_loss: Literal["trajectory", "continuum", "surface", "none"] = Field(
+        "trajectory",
+        description="what of the observed motion a neural law is fitted to: paths of particles, bodies frame by frame, "
+        "their surfaces, or silhouettes alone",
+    )
+    trajectory_weight: float = Field(1.0, ge=0, description="of geometry_loss")
     silhouette_weight: float = Field(0.2, ge=0)
     silhouette_pictures: int = Field(4, ge=0, description="pictures whose silhouette is compared in an iteration")

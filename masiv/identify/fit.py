@@ -13,22 +13,25 @@ import torch
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.problem import Motion, Problem
-from masiv.identify.silhouette import silhouette_error
+from masiv.identify.silhouette import discrepancy, silhouette_errors
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
 
 FAILURES_ALLOWED = 8
+RECOVERY = 1.4
+"""Step sizes that were halved grow by this factor with every step that succeeds."""
 
 
 @dataclass
 class Fit:
-    """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; history: (iteration,
-    frames, trajectory error [m], silhouette error)."""
+    """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; discrepancy: what
+    the fit is chosen by; history: (iteration, frames, trajectory error [m], silhouette error)."""
 
     law: NeuralLaw | AdapterLaw
     motion: Motion
     error_m: float = math.inf
+    discrepancy: float = math.inf
     history: list[tuple[int, int, float, float]] = field(default_factory=list)
 
 
@@ -45,8 +48,9 @@ def fit(
 ) -> Fit:
     """Adam on a horizon that grows from ``first_frames`` to all frames over the first half of the iterations.
 
-    A rollout that diverges is not repaired: the step is taken back and the step sizes are halved; after several in a
-    row the stage stops. Returns the parameters with the least error over all frames. Raises MasivError.
+    A rollout that diverges is not repaired: the step is taken back, the step sizes are halved and the horizon ends a
+    frame earlier, both until steps succeed again; after several in a row the stage stops. Returns the parameters with
+    the least error over all frames. Raises MasivError.
     """
     config = problem.config
     law = copy.deepcopy(law)
@@ -67,15 +71,15 @@ def fit(
     )
     parameters = [*weights, *scales, *motion.tensors()]
     best = Fit(copy.deepcopy(law), Motion(*(t.detach().clone() for t in motion.tensors())))
-    first, caution, failures = 0, 1.0, 0
+    first, caution, failures, reach = 0, 1.0, 0, problem.frames
     saved = checkpoint.load()
     if saved is not None and "fit" in saved:
-        first, caution, failures = _restore(saved["fit"], parameters, optimiser, best)
+        first, caution, failures, reach = _restore(saved["fit"], parameters, optimiser, best)
     accepted = [p.detach().clone() for p in parameters]
     for i in range(first, config.iterations):
-        state = functools.partial(_state, i, caution, failures, parameters, optimiser, best)
+        state = functools.partial(_state, i, caution, failures, reach, parameters, optimiser, best)
         checkpoint.maybe_save(lambda state=state: {"fit": state()})
-        frames = _horizon(i, config.iterations, first_frames, problem.frames)
+        frames = min(reach, _horizon(i, config.iterations, first_frames, problem.frames))
         decay = 0.5 * (1 + math.cos(math.pi * i / config.iterations))
         for group in optimiser.param_groups:
             group["lr"] = group["rate"] * caution * (0.05 + 0.95 * decay)
@@ -84,32 +88,45 @@ def fit(
             positions = problem.run(law, motion, contact, frames)
             error = problem.error(positions)
             silhouette = _silhouette(problem, positions, frames, seed, i)
-            loss = config.trajectory_weight * error / problem.size + config.silhouette_weight * silhouette
+            geometry = error if config.geometry_loss == "trajectory" else problem.geometry_error(positions)
+            loss = config.trajectory_weight * geometry / problem.size + config.silhouette_weight * silhouette
+            if frames == problem.frames:
+                _keep_better(best, problem, positions, law, motion)
             loss.backward()
             if not all(torch.isfinite(p.grad).all() for p in parameters if p.grad is not None):
                 raise NonFiniteError(frames * problem.substeps(law), 0, "the adjoint overflowed")
         except NonFiniteError as diverged:
-            failures, caution = failures + 1, caution / 2
+            failures, caution, reach = failures + 1, caution / 2, max(1, frames - 1)
             if failures > FAILURES_ALLOWED:
                 raise MasivError(f"identify: the fit keeps diverging ({diverged})") from diverged
             with torch.no_grad():
                 for parameter, value in zip(parameters, accepted, strict=True):
                     parameter.copy_(value)
             continue
-        failures = 0
+        failures, caution, reach = 0, min(1.0, RECOVERY * caution), min(problem.frames, reach + 1)
         accepted = [p.detach().clone() for p in parameters]
         best.history.append((i, frames, float(error.detach()), float(silhouette.detach())))
-        if frames == problem.frames and float(error.detach()) < best.error_m:
-            best.error_m = float(error.detach())
-            best.law = copy.deepcopy(law)
-            best.motion = Motion(*(t.detach().clone() for t in motion.tensors()))
         for group in optimiser.param_groups:
             torch.nn.utils.clip_grad_norm_(group["params"], 1.0)
         optimiser.step()
         with torch.no_grad():
             motion.ground_offset.clamp_(-config.ground_range, config.ground_range)
         progress("identify: fit", i + 1, config.iterations, f"{1e3 * best.history[-1][2]:.1f} mm over {frames} frames")
+    if math.isinf(best.discrepancy):  # no step reached the last frame
+        with torch.no_grad():
+            for parameter, value in zip(parameters, accepted, strict=True):
+                parameter.copy_(value)
+            _keep_better(best, problem, problem.run(law, motion, contact, problem.frames), law, motion)
     return best
+
+
+def _keep_better(best: Fit, problem: Problem, positions: torch.Tensor, law: NeuralLaw | AdapterLaw, motion: Motion):
+    """Put law and throw into ``best`` where their ``positions`` over all frames are nearer to what was observed."""
+    here = discrepancy(problem, positions)
+    if here < best.discrepancy:
+        best.discrepancy, best.error_m = here, float(problem.error(positions.detach()))
+        best.law = copy.deepcopy(law)
+        best.motion = Motion(*(t.detach().clone() for t in motion.tensors()))
 
 
 def _horizon(iteration: int, iterations: int, first: int, last: int) -> int:
@@ -123,39 +140,36 @@ def _silhouette(problem: Problem, positions: torch.Tensor, frames: int, seed: in
     if config.silhouette_pictures == 0 or config.silhouette_weight == 0:
         return torch.zeros(())
     random = np.random.default_rng((seed, iteration))
-    spacing = (problem.volume / problem.count) ** (1 / 3)
-    rotation = torch.as_tensor(problem.axes.rotation, dtype=torch.float32)
-    translation = torch.as_tensor(problem.axes.translation, dtype=torch.float32)
-    errors = []
+    pictures = []
     for _ in range(config.silhouette_pictures):
         frame = int(random.integers(1, frames + 1))
-        view = int(random.choice(scene.views))
-        world = (positions[frame * problem.samples - 1] - translation) @ rotation
-        errors.append(silhouette_error(scene, view, frame, world, spacing))
-    return torch.stack(errors).mean()
+        pictures.append((frame, int(random.choice(scene.views))))
+    return silhouette_errors(problem, positions, pictures)
 
 
-def _state(iteration, caution, failures, parameters, optimiser, best: Fit) -> dict:
+def _state(iteration, caution, failures, reach, parameters, optimiser, best: Fit) -> dict:
     return {
         "iteration": iteration,
         "caution": caution,
         "failures": failures,
+        "reach": reach,
         "parameters": [p.detach() for p in parameters],
         "optimiser": optimiser.state_dict(),
         "best_law": best.law.state_dict(),
         "best_motion": list(best.motion.tensors()),
         "best_error": best.error_m,
+        "best_discrepancy": best.discrepancy,
         "history": best.history,
     }
 
 
-def _restore(state: dict, parameters, optimiser, best: Fit) -> tuple[int, float, int]:
+def _restore(state: dict, parameters, optimiser, best: Fit) -> tuple[int, float, int, int]:
     with torch.no_grad():
         for parameter, value in zip(parameters, state["parameters"], strict=True):
             parameter.copy_(value)
     optimiser.load_state_dict(state["optimiser"])
     best.law.load_state_dict(state["best_law"])
     best.motion = Motion(*state["best_motion"])
-    best.error_m = state["best_error"]
+    best.error_m, best.discrepancy = state["best_error"], state["best_discrepancy"]
     best.history = [tuple(row) for row in state["history"]]
-    return state["iteration"], state["caution"], state["failures"]
+    return state["iteration"], state["caution"], state["failures"], state["reach"]

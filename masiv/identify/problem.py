@@ -12,6 +12,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.effects.effect import Setting
 from masiv.identify.config import IdentifyConfig
+from masiv.identify.geometry import chamfer_error, surface_points, trajectory_error
 from masiv.materials.law import Law
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
@@ -78,12 +79,14 @@ class Problem:
         instants = np.arange(1, self.frames * self.samples + 1) / (self.samples * scene.fps)
         points = trajectory.evaluate(np.concatenate([[0.0], instants]))
         self.chosen = np.arange(points.shape[1])
+        on_surface = surface_points(points[0]) if config.geometry_loss == "surface" else None
         if particles is not None and particles < points.shape[1]:
             chosen = np.random.default_rng(seed).choice(points.shape[1], particles, replace=False)
             self.chosen = np.sort(chosen)
             points = points[:, self.chosen]
         moved = torch.as_tensor(self.axes.points_to_simulation(points), dtype=torch.float32)
         self.start, self.targets = moved[0].contiguous(), moved[1:]
+        self.surface = None if on_surface is None else torch.from_numpy(np.flatnonzero(on_surface[self.chosen]))
         self.count = len(self.start)
         self.volume = trajectory.volume
         self.spacing = grid_spacing(self.volume, self.count, simulator)
@@ -145,7 +148,7 @@ class Problem:
             gravity=self.gravity,
             contact=contact if self.scene.ground is not None else "none",
             memory_mb=self.simulator.memory_mb,
-            max_substeps=512,
+            max_substeps=1024,
             grid_nodes=self.simulator.grid_nodes,
             chunks=self.simulator.chunks,
         )
@@ -168,4 +171,15 @@ class Problem:
 
     def error(self, positions: torch.Tensor) -> torch.Tensor:
         """Mean distance [m] to the observed trajectories, positions (K, N, 3) from the start."""
-        return (positions - self.targets[: len(positions)]).norm(dim=2).mean()
+        return trajectory_error(positions, self.targets[: len(positions)])
+
+    def geometry_error(self, positions: torch.Tensor) -> torch.Tensor:
+        """What ``config.geometry_loss`` compares, [m]; zero where that is none. positions as of ``error``."""
+        if self.config.geometry_loss == "trajectory":
+            return self.error(positions)
+        if self.config.geometry_loss == "none":
+            return torch.zeros(())
+        here, there = (p[self.samples - 1 :: self.samples] for p in (positions, self.targets[: len(positions)]))
+        if self.surface is not None:
+            here, there = here[:, self.surface], there[:, self.surface]
+        return chamfer_error(here, there)

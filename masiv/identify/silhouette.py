@@ -5,12 +5,43 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from masiv.identify.problem import Problem
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 from masiv.splat.rasteriser import render
 
 MARGIN = 6  # pixels around the mask's box
 OPACITY = 0.9
+
+
+def silhouette_errors(problem: Problem, positions: torch.Tensor, pictures: list[tuple[int, int]]) -> torch.Tensor:
+    """Mean error of ``pictures`` (frame, view); positions (K, N, 3) [m, simulation frame] as ``Problem.run`` has
+    them."""
+    spacing = (problem.volume / problem.count) ** (1 / 3)
+    rotation = torch.as_tensor(problem.axes.rotation, dtype=torch.float32)
+    translation = torch.as_tensor(problem.axes.translation, dtype=torch.float32)
+    errors = [
+        silhouette_error(
+            problem.scene, view, frame, (positions[frame * problem.samples - 1] - translation) @ rotation, spacing
+        )
+        for frame, view in pictures
+    ]
+    return torch.stack(errors).mean()
+
+
+def one_of_each(problem: Problem, frames: int) -> list[tuple[int, int]]:
+    """A picture of each of the first ``frames`` frames, the views in turn: (frame, view)."""
+    views = problem.scene.views
+    return [(frame, views[frame % len(views)]) for frame in range(1, frames + 1)]
+
+
+def discrepancy(problem: Problem, positions: torch.Tensor) -> float:
+    """What candidates are compared by: the geometrical objective [m], or, without one, the silhouettes [1]."""
+    with torch.no_grad():
+        if problem.config.geometry_loss == "none":
+            frames = len(positions) // problem.samples
+            return float(silhouette_errors(problem, positions, one_of_each(problem, frames)))
+        return float(problem.geometry_error(positions))
 
 
 def silhouette_error(scene: Scene, view: int, frame: int, points: torch.Tensor, spacing: float) -> torch.Tensor:

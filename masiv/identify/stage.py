@@ -142,7 +142,12 @@ def _neural(
     fitted = fit(
         problem, start.law, motion, start.contact, first_frames, seed=seed, checkpoint=keeper, progress=progress
     )
-    report = {"start": start.material, "start_error_mm": 1e3 * start.error}
+    report = {"start": start.material, "geometry_loss": problem.config.geometry_loss}
+    report |= (
+        {"start_silhouette": start.error}
+        if report["geometry_loss"] == "none"
+        else {"start_error_mm": 1e3 * start.error}
+    )
     return Found(fitted.law, fitted.motion, start.contact, fitted.error_m, report, history_rows(fitted))
 
 

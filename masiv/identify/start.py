@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.problem import Motion, Problem
+from masiv.identify.silhouette import discrepancy
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
 from masiv.materials.pretrain import MATERIALS, pretrained_path
@@ -26,7 +27,7 @@ DIVERGED = 1e3
 
 @dataclass(frozen=True)
 class Start:
-    """A law to start from; error [m] is that of its rollout with few particles."""
+    """A law to start from; error: ``discrepancy`` of its rollout with few particles, [m] or, of silhouettes, [1]."""
 
     material: str
     contact: str
@@ -62,7 +63,7 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress) -> list[S
             for modulus in MODULI:
                 error = _error(problem, motion, laws[name], contact, modulus * density, 1.0)
                 coarse.append((error, name, contact, modulus * density))
-                progress("identify: start", len(coarse), total, f"{name}, {contact}: {1e3 * error:.0f} mm")
+                progress("identify: start", len(coarse), total, f"{name}, {contact}: {said(problem, error)}")
     best = {}
     for error, name, contact, modulus in sorted(coarse):
         best.setdefault(name, (error, contact, modulus))
@@ -73,8 +74,15 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress) -> list[S
     for done, name in enumerate(ranked):
         _, contact, modulus = best[name]
         starts.append(_refined(problem, motion, name, laws[name], contact, modulus))
-        progress("identify: start", done + 1, len(ranked), f"{name}: {1e3 * starts[-1].error:.1f} mm")
+        progress("identify: start", done + 1, len(ranked), f"{name}: {said(problem, starts[-1].error)}")
     return sorted(starts, key=lambda start: start.error)
+
+
+def said(problem: Problem, error: float) -> str:
+    """An error for people."""
+    if error >= DIVERGED:
+        return "diverges"
+    return f"silhouettes {error:.3f}" if problem.config.geometry_loss == "none" else f"{1e3 * error:.1f} mm"
 
 
 def _refined(problem: Problem, motion: Motion, name: str, law: NeuralLaw, contact: str, modulus: float) -> Start:
@@ -95,6 +103,6 @@ def _refined(problem: Problem, motion: Motion, name: str, law: NeuralLaw, contac
 def _error(problem: Problem, motion: Motion, law: NeuralLaw, contact: str, modulus: float, flow: float) -> float:
     scaled = with_scales(law, modulus, flow)
     try:
-        return float(problem.error(problem.run(scaled, motion, contact, problem.frames)))
+        return discrepancy(problem, problem.run(scaled, motion, contact, problem.frames))
     except NonFiniteError:
         return DIVERGED

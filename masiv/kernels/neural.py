@@ -12,48 +12,45 @@ from masiv.materials.table import COUNTS, LOWER, STEP
 
 @ti.data_oriented
 class NeuralKernels:
-    """``moduli`` (nodes, 4): ln g1, ln g2, ln kappa, coupling of ``tensor.neural_stress`` [Pa]; ``rates`` (nodes, 2):
-    logarithms [1/s] of the relaxation rates behind ``tensor.neural_flow``. ``*_bar`` are their adjoints by chunk."""
+    """``moduli`` (nodes, 4): ln g1, ln g2, ln kappa, coupling of ``tensor.neural_stress`` [Pa]; ``flows`` (nodes, 2):
+    -ln of the shares of strain that ``tensor.neural_flow`` keeps. ``*_bar`` are their adjoints by chunk."""
 
     def __init__(self, mpm):
         self.mpm = mpm
         self.owner = None  # the rollout whose tables the fields hold
         nodes = COUNTS[0] * COUNTS[1] * COUNTS[2]
         self.moduli = ti.Vector.field(4, mpm.real, shape=nodes)
-        self.rates = ti.Vector.field(2, mpm.real, shape=nodes)
+        self.flows = ti.Vector.field(2, mpm.real, shape=nodes)
         self.strains = ti.field(mpm.real, shape=2)  # strain scale of the elastic and of the plastic features
-        self.substep = ti.field(mpm.real, shape=())
         self.moduli_bar = ti.Vector.field(4, mpm.real, shape=(mpm.chunks, nodes))
-        self.rates_bar = ti.Vector.field(2, mpm.real, shape=(mpm.chunks, nodes))
+        self.flows_bar = ti.Vector.field(2, mpm.real, shape=(mpm.chunks, nodes))
         self.flow_strain_bar = ti.field(mpm.real, shape=mpm.capacity_particles)
 
     @ti.kernel
     def write_tables(
         self,
         moduli: ti.types.ndarray(),
-        rates: ti.types.ndarray(),
+        flows: ti.types.ndarray(),
         elastic: ti.f64,
         plastic: ti.f64,
-        dt: ti.f64,
         count: ti.i32,
     ):
-        """Tables (nodes, 4), (nodes, 2), the two strain scales and the substep [s]; adjoints start at zero."""
+        """Tables (nodes, 4), (nodes, 2), and the two strain scales; adjoints start at zero."""
         for n in range(moduli.shape[0]):
             for a in ti.static(range(4)):
                 self.moduli[n][a] = moduli[n, a]
             for a in ti.static(range(2)):
-                self.rates[n][a] = rates[n, a]
+                self.flows[n][a] = flows[n, a]
             for t in ti.static(range(self.mpm.chunks)):
                 self.moduli_bar[t, n] = ti.Vector.zero(self.mpm.real, 4)
-                self.rates_bar[t, n] = ti.Vector.zero(self.mpm.real, 2)
+                self.flows_bar[t, n] = ti.Vector.zero(self.mpm.real, 2)
         for p in range(count):
             self.flow_strain_bar[p] = 0.0
         self.strains[0] = ti.cast(elastic, self.mpm.real)
         self.strains[1] = ti.cast(plastic, self.mpm.real)
-        self.substep[None] = ti.cast(dt, self.mpm.real)
 
     @ti.kernel
-    def read_bars(self, moduli: ti.types.ndarray(), rates: ti.types.ndarray(), strain: ti.types.ndarray()):
+    def read_bars(self, moduli: ti.types.ndarray(), flows: ti.types.ndarray(), strain: ti.types.ndarray()):
         """Adjoints of what ``write_tables`` takes; strain (N,) by particle."""
         for n in range(moduli.shape[0]):
             for a in ti.static(range(4)):
@@ -61,9 +58,9 @@ class NeuralKernels:
                 for t in ti.static(range(self.mpm.chunks)):
                     moduli[n, a] += self.moduli_bar[t, n][a]
             for a in ti.static(range(2)):
-                rates[n, a] = 0.0
+                flows[n, a] = 0.0
                 for t in ti.static(range(self.mpm.chunks)):
-                    rates[n, a] += self.rates_bar[t, n][a]
+                    flows[n, a] += self.flows_bar[t, n][a]
         for p in range(strain.shape[0]):
             strain[p] = self.flow_strain_bar[p]
 
@@ -155,10 +152,9 @@ class NeuralKernels:
         return ti.Vector([ti.exp(table_value[0]), ti.exp(table_value[1]), ti.exp(table_value[2]), table_value[3]])
 
     @ti.func
-    def share(self, log_rate):
-        """1 - exp(-dt rate), also where that is below the rounding of 1."""
-        x = self.substep[None] * ti.exp(log_rate)
-        return ti.select(x < 0.01, x * (1.0 - 0.5 * x * (1.0 - x / 3.0)), 1.0 - ti.exp(-x))
+    def share(self, flow):
+        """1 - exp(-flow), also where that is below the rounding of 1."""
+        return ti.select(flow < 0.01, flow * (1.0 - 0.5 * flow * (1.0 - flow / 3.0)), 1.0 - ti.exp(-flow))
 
     # ---- the law -------------------------------------------------------------------------------------------------
 
@@ -166,9 +162,8 @@ class NeuralKernels:
     def particle(self, s: ti.i32, p: ti.i32):
         trial = self.mpm.trial_gradient[s, p]
         cell, inside, _ = self.locate(self.features(tensor.invariants(trial), self.strains[1]))
-        f = tensor.neural_flow(
-            trial, self.share(self.sample(self.rates, ti.Vector.zero(self.mpm.real, 2), cell, inside))
-        )
+        flow = self.sample(self.flows, ti.Vector.zero(self.mpm.real, 2), cell, inside)
+        f = tensor.neural_flow(trial, self.share(flow))
         cell, inside, _ = self.locate(self.features(tensor.invariants(f), self.strains[0]))
         c = self.coefficients(self.sample(self.moduli, ti.Vector.zero(self.mpm.real, 4), cell, inside))
         self.mpm.deformation_gradient[s, p] = f
@@ -205,12 +200,9 @@ class NeuralKernels:
         # Flow.
         before = tensor.invariants(trial)
         cell, inside, slope = self.locate(self.features(before, self.strains[1]))
-        log_rate = self.sample(self.rates, ti.Vector.zero(self.mpm.real, 2), cell, inside)
-        trial_bar, share_bar = tensor.neural_flow_adjoint(trial, self.share(log_rate), out_bar)
-        x = self.substep[None] * ti.exp(log_rate)
-        feature_bar = self.sample_adjoint(
-            self.rates, self.rates_bar, t, cell, inside, slope, share_bar * x * ti.exp(-x)
-        )
+        flow = self.sample(self.flows, ti.Vector.zero(self.mpm.real, 2), cell, inside)
+        trial_bar, share_bar = tensor.neural_flow_adjoint(trial, self.share(flow), out_bar)
+        feature_bar = self.sample_adjoint(self.flows, self.flows_bar, t, cell, inside, slope, share_bar * ti.exp(-flow))
         invariants_bar, strain_bar = self.features_adjoint(before, self.strains[1], feature_bar)
         self.mpm.trial_bar[p] = trial_bar + tensor.invariants_adjoint(trial, invariants_bar)
         self.flow_strain_bar[p] += strain_bar

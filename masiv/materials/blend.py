@@ -78,7 +78,8 @@ class BlendedLaw(Law):
 
     def flow_share(self, invariants: torch.Tensor, dt: float) -> torch.Tensor:
         """As ``NeuralLaw.flow_share``."""
-        return -torch.expm1(-dt * torch.exp(self.log_rates(invariants)[0]))
+        first, second = (torch.log(-torch.log1p(-law.flow_share(invariants, dt))) for law in (self.first, self.second))
+        return -torch.expm1(-torch.exp((1 - self.weight) * first + self.weight * second))
 
     def project(self, trial_gradient: torch.Tensor, dt: float) -> torch.Tensor:
         return NeuralLaw.project(self, trial_gradient, dt)  # type: ignore[arg-type]

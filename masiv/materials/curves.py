@@ -49,6 +49,8 @@ def tabulated(law: L) -> L:
     for name in ("moduli_table", "rate_table"):
         if hasattr(law, name):
             setattr(law, name, functools.partial(_known, getattr(law, name)()))
+    if hasattr(law, "flow_table"):
+        setattr(law, "flow_table", functools.lru_cache(maxsize=8)(law.flow_table))  # noqa: B010  (a module's __setattr__)
     return law
 
 

@@ -6,6 +6,11 @@ principal stresses are ordered as the principal stretches are (the Baker-Erickse
 compression. The flow is a rate, so the law does not depend on the substep: elastic bodies, viscous fluids, plasticity
 and sand are relaxation times that depend on strain in different ways.
 
+A rate that is taken from the strain before a substep overshoots where it rises steeply, as at a yield stress: more
+strain would leave less of it. The motion then chatters a little, and its derivative grows by a factor a substep. So the
+strain that flows within a substep is bounded such that what is kept never falls where the strain rises: the steepest
+law is perfect plasticity, whose derivative is none.
+
 differs from MASIV and NCLaw: their networks see F^T F entry by entry (frame indifferent but not isotropic) and correct
 F once a substep, which ties the law to the substep.
 """
@@ -26,6 +31,7 @@ if TYPE_CHECKING:
 
 STRAIN_SCALE = 0.02
 LOG_MODULUS_RANGE = 6.0
+ALL_FLOWS = 30.0  # e^-30 of a strain is none
 LOG_RATE_RANGE = 14.0  # relaxation rates of e^-14 to e^14 per second
 
 
@@ -82,6 +88,10 @@ class NeuralLaw(Law):
         """Logarithms of the isochoric and volumetric relaxation rate [1/s] at the nodes, (K, 2)."""
         return LOG_RATE_RANGE * torch.tanh(self.plastic(table.nodes(self.log_stress_scale.dtype)) / LOG_RATE_RANGE)
 
+    def flow_table(self, dt: float) -> torch.Tensor:
+        """-ln of the shares of isochoric and volumetric strain that a substep of dt [s] keeps, at the nodes, (K, 2)."""
+        return table.gentle((dt * torch.exp(self.rate_table())).clamp_max(ALL_FLOWS))
+
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
         """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
         value = table.interpolate(self.moduli_table(), self.features(invariants, STRAIN_SCALE))
@@ -89,8 +99,8 @@ class NeuralLaw(Law):
 
     def flow_share(self, invariants: torch.Tensor, dt: float) -> torch.Tensor:
         """Shares (N, 2) of the isochoric and volumetric elastic strain that flow within dt [s]."""
-        log_rate = table.interpolate(self.rate_table(), self.features(invariants, torch.exp(self.log_flow_strain)))
-        return -torch.expm1(-dt * torch.exp(log_rate))
+        features = self.features(invariants, torch.exp(self.log_flow_strain))
+        return -torch.expm1(-table.interpolate(self.flow_table(dt), features))
 
     def project(self, trial_gradient: torch.Tensor, dt: float) -> torch.Tensor:
         share = self.flow_share(strain_invariants(trial_gradient), dt)
@@ -164,19 +174,18 @@ class _BoundNeural(SharedBoundLaw):
     """The networks run once here; kernels interpolate their tables."""
 
     def __init__(self, law: NeuralLaw, mpm: MpmKernels, count: int, dt: float) -> None:
-        self.dt = dt
         self.kernels = _neural_kernels(mpm)
         self.count = count
         self.parameters = tuple(law.parameters())
         with torch.enable_grad():
-            self.tables = (law.moduli_table(), law.rate_table(), torch.exp(law.log_flow_strain))
+            self.tables = (law.moduli_table(), law.flow_table(dt), torch.exp(law.log_flow_strain))
         self.dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
         self._own()
 
     def write(self) -> None:
-        moduli, rates = (t.detach().to(self.dtype).contiguous() for t in self.tables[:2])
+        moduli, flows = (t.detach().to(self.dtype).contiguous() for t in self.tables[:2])
         flow_strain = float(self.tables[2].detach())
-        self.kernels.write_tables(moduli, rates, STRAIN_SCALE, flow_strain, self.dt, self.count)
+        self.kernels.write_tables(moduli, flows, STRAIN_SCALE, flow_strain, self.count)
 
     def parameter_gradients(self) -> tuple[torch.Tensor | None, ...]:
         bars = [torch.empty(len(self.tables[0]), width, dtype=self.dtype) for width in (4, 2)]

@@ -11,6 +11,7 @@ import torch
 STEP = 0.25
 LOWER = (-6.0, 0.0, -1.0)
 COUNTS = (49, 33, 9)
+ROUNDING = 1e-5
 
 
 @functools.lru_cache(maxsize=2)
@@ -34,3 +35,20 @@ def interpolate(table: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         i, j, k = (cell + corner).unbind(1)
         out = out + weight * table[(i * COUNTS[1] + j) * COUNTS[2] + k]
     return out
+
+
+def gentle(values: torch.Tensor) -> torch.Tensor:
+    """The largest table below ``values`` (K, C) that changes by no more than 1 for a unit of any feature.
+
+    The lower envelope of cones with L1 distance, one sweep to and fro along each axis (Felzenszwalb & Huttenlocher
+    2012). Where it cuts, the gradient goes to the node that a cone stands on.
+    """
+    grid = values.reshape(*COUNTS, -1)
+    for axis, count in enumerate(COUNTS):
+        shape = [1, 1, 1, 1]
+        shape[axis] = count
+        ramp = STEP * torch.arange(count, dtype=values.dtype).reshape(shape)
+        for _ in range(2):
+            grid = (torch.cummin(grid - ramp, dim=axis).values + ramp).flip(axis)
+    bound = grid.reshape(values.shape)
+    return torch.where(bound < values - ROUNDING, bound, values)  # what is not cut keeps its digits

@@ -35,10 +35,6 @@ class RefineConfig(BaseModel):
     decisive_gain: float = Field(
         0.5, ge=0, le=1, description="share of the held-out error whose removal is enough evidence alone"
     )
-    simple_gain: float = Field(
-        0.2, ge=0, le=1,
-        description="share of the held-out error whose removal is enough for an effect that has nothing but a strength",
-    )  # fmt: skip
     decisive: float = Field(
         4.0, ge=1,
         description="variance that an effect must explain, over the noise's, in the phase where the simulation is as "

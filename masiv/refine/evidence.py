@@ -129,7 +129,7 @@ def explains_too_little(
     confirmed = won.mean() >= SIMPLER and removed >= config.least_gain
     plain = fitted.certain is not None and fitted.certain >= config.decisive and abs(won.mean()) < 1
     decisive = won.mean() >= SIMPLER and removed >= config.decisive_gain and share > 0
-    simple = confirmed and not adapts and removed >= config.simple_gain and share > 0
+    simple = not adapts and removed >= config.least_gain and share > 0
     if (confirmed and share >= 1) or plain or decisive or simple:
         return []
     held_out = (

@@ -87,7 +87,8 @@ class _Following:
         first, second = neighbour_pairs(means.double().numpy(), config.neighbours)
         self.pairs = torch.from_numpy(first), torch.from_numpy(second)
         self.half_extent = known.settings["half_extent"]
-        pulls = dict(zip(new, map(HullPull, hulls[1:]), strict=True))
+        volume = visual_hull(scene, 0, resolution=config.hull_resolution).volume
+        pulls = {frame: HullPull(hull, volume) for frame, hull in zip(new, hulls[1:], strict=True)}
         scale = float(dynamic.canonical.scales.mean())
         self.objective = Objective(config, scale, self.half_extent, scene.fps, scene.ground, pulls)
 
