@@ -3,6 +3,7 @@
     python benchmarks/measured.py scenes --out DIR        # scenes that masiv reads, one folder each
     python benchmarks/measured.py balls [--json FILE]
     python benchmarks/measured.py damping --particles 400 1000 1728 --youngs 310e3 --viscosity 250
+    python benchmarks/measured.py load --youngs 306.4e3 --viscosity 203
 
 The measurements are in the folder that MASIV_MEASURED names, ../shared/measured beside the repository by default. They
 are public: see benchmarks/measured.md.
@@ -30,6 +31,8 @@ MARKERS_AT = {"tip1": [36, 15, 0], "tip2": [24, -6, 0], "tip3": [6, 36, 0],
 BEAM_AT_REST = {("gravity", "a"): [20, 60], ("gravity", "b"): [20, 55],
                 ("load52", "a"): [10, 35], ("load52", "b"): [10, 45]}  # fmt: skip
 """Frames in which the beam is held straight."""
+LOAD_UNSTEADY = 0.1
+"""How long [s] after the release the loaded tip stops and goes (0.31, 0.18, 0.37 m/s after 28, 48 and 68 ms)."""
 
 
 def data_folder() -> Path:
@@ -71,11 +74,12 @@ def write_beam(source: Path, out: Path) -> Path:
     _link(source / "beam.stl", out)
     runs = []
     for kind, condition in (("gravity", ""), ("load52", "load52")):
+        unsteady = {} if not condition else {"unsteady": LOAD_UNSTEADY}
         for repeat, use in (("a", "fit"), ("b", "hold_out")):
             name = f"beam_{kind}_V2_{repeat}.csv"
             _link(source / name, out)
             runs.append({"file": name, "name": f"{kind}_{repeat}", "condition": condition, "use": use,
-                         "rest_frames": BEAM_AT_REST[kind, repeat]})  # fmt: skip
+                         "rest_frames": BEAM_AT_REST[kind, repeat], **unsteady})  # fmt: skip
     body = {
         "density": 1070,
         "poissons_ratio": 0.499,
@@ -196,6 +200,44 @@ def damping(
     return rows
 
 
+def load(source: Path, youngs: float, viscosity: float, particles: int, courant: float, what: list[str]) -> list[dict]:
+    """The loaded beam with one effect at the middle of its end, law and viscosity known: what is left of load52_a, from
+    0.1 to 0.6 s after its release, and of load52_b, which is held out."""
+    from masiv.mpm.config import SimulatorConfig
+    from masiv.refine.model import Model
+    from masiv.refine.refit import full_fit
+    from masiv.tracks.config import TracksConfig
+    from masiv.tracks.fit import family_of, simulation_of
+    from masiv.tracks.read import read_tracks
+
+    with tempfile.TemporaryDirectory() as folder:
+        tracks = read_tracks(write_beam(source, Path(folder)))
+    law = {"poissons_ratio": 0.45, "youngs_modulus": youngs, "viscosity.viscosity": viscosity}
+    config = SimulatorConfig.model_validate({"courant_number": courant, "max_substeps_per_frame": 4000})
+    begins = {"nothing": {}, "point_mass": {"mass": 0.06}, "point_force": {"force_y": -0.6, "force_x": 0, "force_z": 0}}
+    rows = []
+    for name in what:
+        began = time.perf_counter()
+        settings = TracksConfig(particles=particles, duration=0.6)
+        simulation = simulation_of(tracks, "load52", settings, config, known=law)
+        effects = ("viscosity",) if name == "nothing" else ("viscosity", name)
+        values = {f"{name}.{n}": float(v) for n, v in begins[name].items()} | {"lift@load52_a": -0.006}
+        held: frozenset[str] = frozenset()
+        if name != "nothing":
+            place = max(simulation.term(name).guesses, key=lambda guess: guess[2])  # along the body, from the clamp
+            values |= dict(zip((f"{name}.{axis}" for axis in "xyz"), place, strict=True))
+            held = frozenset(f"{name}.{axis}" for axis in "xyz")
+        model = Model(family_of("neo_hookean", 1070, law), "none", effects)
+        fitted = full_fit(simulation, model, values, budget=60, held=held)
+        rows.append({
+            "effect": name, "load52_a_mm": fitted.fit_mm, "load52_b_mm": fitted.held_out_mm,
+            "values": {n: [v, fitted.stderr.get(n)] for n, v in fitted.values.items()},
+            "rollouts": simulation.rollouts, "seconds": time.perf_counter() - began,
+        })  # fmt: skip
+        print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
 def _held(simulation, trials: dict, name: str) -> dict | None:
     if name not in trials:
         return None
@@ -205,7 +247,7 @@ def _held(simulation, trials: dict, name: str) -> dict | None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="?", default="balls", choices=["scenes", "balls", "damping"])
+    parser.add_argument("what", nargs="?", default="balls", choices=["scenes", "balls", "damping", "load"])
     parser.add_argument("--out", type=Path, default=Path("measured_scenes"))
     parser.add_argument("--json", type=Path)
     parser.add_argument("--particles", type=int, nargs="+", default=[400, 1000])
@@ -213,6 +255,7 @@ def main() -> None:
     parser.add_argument("--viscosity", type=float, default=250.0, help="[Pa s]")
     parser.add_argument("--duration", type=float, default=0.6, help="[s]")
     parser.add_argument("--courant", type=float, default=0.6)
+    parser.add_argument("--effects", nargs="+", default=["point_mass", "point_force"], help="of load")
     asked = parser.parse_args()
     source = data_folder()
     if not source.is_dir():
@@ -231,6 +274,10 @@ def main() -> None:
     if asked.what == "damping":
         found = damping(
             source / "silicone_beam", asked.particles, asked.youngs, asked.viscosity, asked.duration, asked.courant
+        )
+    elif asked.what == "load":
+        found = load(
+            source / "silicone_beam", asked.youngs, asked.viscosity, asked.particles[0], asked.courant, asked.effects
         )
     else:
         found = balls(source / "ball_drops")

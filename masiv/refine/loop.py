@@ -230,7 +230,7 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
 
 def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
     """``fitted`` as a start in another simulation of the same experiments."""
-    budget = 4 * (len(fitted.parameters) + 1)
+    budget = 8 * (len(simulation.parameters(fitted.model)) + 1)
     held = held_in(simulation, fitted)
     return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft, held=held)
 

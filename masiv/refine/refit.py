@@ -290,8 +290,9 @@ def full_fit(
 
 
 def held_in(simulation: Simulated, fitted: Fitted) -> frozenset[str]:
-    """Names of parameters of a model that ``fitted`` left as they were."""
-    return frozenset(p.name for p in simulation.parameters(fitted.model)) - {p.name for p in fitted.parameters}
+    """Names of parameters of a model that have values in ``fitted``, which left them as they were."""
+    own = {p.name for p in fitted.parameters}
+    return frozenset(p.name for p in simulation.parameters(fitted.model) if p.name in fitted.values) - own
 
 
 def started(params: Sequence[Parameter], values: Mapping[str, float]) -> tuple[Parameter, ...]:

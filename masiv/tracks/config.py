@@ -12,11 +12,6 @@ class TracksConfig(BaseModel):
 
     particles: int = Field(1700, ge=50, description="particles of the body")
     duration: float = Field(1.0, gt=0, description="how long after its release a run is fitted and judged [s]")
-    skip: float = Field(
-        0.0, ge=0,
-        description="how long after its release a run is not looked at [s], for what lets go of a body is not in the "
-        "model (a hand, a thread that is slack at first); then how far it was lifted and held up are fitted as well",
-    )  # fmt: skip
     search_duration: float = Field(
         0.1, gt=0, description="how long of it the first search for a law's scale looks at [s]; then twice that, and on"
     )

@@ -120,7 +120,9 @@ class RunDeclaration(_Part):
     values. ``use``: fit on it, or hold it out. ``condition``: runs of a condition share what was done to the body (a
     load, a wind). ``markers``: keep only these. ``rest_frames`` [first, last): the body is held at rest there;
     ``release_time`` [s, the file's]: it is let go, found in the data where it is left out. ``time`` [s]: use only from
-    the first to the second."""
+    the first to the second. ``unsteady`` [s]: how long after its release a run is not compared with the model, for
+    what lets go is not in it (a hand that follows, a thread that is slack at first); then how far the body was held up
+    and an effective start are fitted as well."""
 
     file: Path
     name: str | None = None
@@ -131,6 +133,7 @@ class RunDeclaration(_Part):
     markers: tuple[str, ...] | None = None
     rest_frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = None
     release_time: FiniteFloat | None = None
+    unsteady: Annotated[FiniteFloat, Field(ge=0)] = 0.0
     time: tuple[FiniteFloat, FiniteFloat] | None = None
 
     @model_validator(mode="after")

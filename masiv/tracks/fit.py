@@ -48,24 +48,25 @@ def runs_of(tracks: Tracks, condition: str) -> tuple[Run, ...]:
 
 def simulation_of(
     tracks: Tracks, condition: str, config: TracksConfig, simulator: SimulatorConfig, *, known: dict[str, float],
-    folder: Path | None = None,
+    folder: Path | None = None, whole: bool = False,
 ) -> BodySimulation:  # fmt: skip
-    """The runs of ``condition`` over the configured time."""
+    """The runs of ``condition`` over the configured time; ``whole``: with the first moments that they leave out."""
     body = only_body(tracks)
     if body.geometry is None:
         raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass, to be simulated")
 
-    def made(particles: int) -> list[BodyRun]:
+    def made(particles: int, whole: bool) -> list[BodyRun]:
         spacing = (body.geometry.volume / particles) ** (1 / 3)
         return [
-            body_run(tracks, run, simulator, spacing, config.duration, config.skip)
+            body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.unsteady)
             for run in runs_of(tracks, condition)
         ]
 
-    runs = made(config.particles)
+    runs = made(config.particles, whole)
+    entire = made(config.particles, True) if any(run.skip for run in runs) else ()
     last = max(float(run.times[-1]) for run in runs)
-    horizons = [h for k in range(16) if (h := config.skip + config.search_duration * 2**k) < 0.9 * last]
-    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder)
+    horizons = [h for k in range(16) if (h := config.search_duration * 2**k) < 0.9 * last]
+    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder, whole=entire)
 
 
 def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:
@@ -87,13 +88,12 @@ def fit_law(simulation: BodySimulation, family: Family, config: TracksConfig, pr
     the phase from which the rest is counted. Raises MasivError where every law diverges."""
     contact = "sticky" if simulation.ground else "none"
     model = Model(family, contact)
-    if config.skip:
-        whole = config.model_copy(update={"skip": 0.0})
-        started = simulation_of(
-            simulation.tracks, simulation.experiments[0].condition, whole, simulation.config,
-            known=simulation.known, folder=simulation.folder,
+    if any(run.skip for run in simulation.experiments):
+        whole = simulation_of(
+            simulation.tracks, simulation.experiments[0].condition, config, simulation.config,
+            known=simulation.known, folder=simulation.folder, whole=True,
         )  # fmt: skip
-        return full_fit(simulation, model, fit_law(started, family, whole, progress).values, budget=config.rollouts)
+        return full_fit(simulation, model, fit_law(whole, family, config, progress).values, budget=config.rollouts)
     horizon, last = config.search_duration, max(float(run.times[-1]) for run in simulation.experiments)
     values = _searched(_cut(simulation, horizon), model, progress)
     while True:

@@ -146,7 +146,8 @@ def _run(
         release = found_release(times, positions[:, free], rest, at_rest[free], noise[free])
         if release is None:
             problems.append(f"{where}: it never leaves its rest position by more than the noise: no release found")
-    made = Run(name, body, run.condition, run.use, markers, times, positions, rate, rest, at_rest, noise, release, None)
+    made = Run(name, body, run.condition, run.use, markers, times, positions, rate, rest, at_rest, noise, release, None,
+               run.unsteady)  # fmt: skip
     made = replace(made, placement=_placement(where, made, declared.bodies[body], problems))
     return made if run.time is None else made.between(*run.time)
 

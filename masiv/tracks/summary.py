@@ -68,7 +68,11 @@ def identity(tracks: Tracks) -> dict[str, Any]:
     return {
         "layout": "tracks",
         "bodies": list(tracks.bodies),
-        "runs": [f"{run.name}: {run.purpose}, {len(run.times)} frames" for run in tracks.runs],
+        "runs": [
+            f"{run.name}: {run.purpose}, {len(run.times)} frames"
+            + (f" from {run.unsteady:g} s" if run.unsteady else "")
+            for run in tracks.runs
+        ],
         "up": tracks.up.tolist(),
         "gravity_m_s2": tracks.gravity.tolist(),
         "positions_sha256": digest.hexdigest()[:16],

@@ -49,7 +49,7 @@ class Run:
     or hold_out; rest: frames at rest before the release; at_rest (M, 3): where markers are then (in the first frame
     that shows them, without rest frames), NaN for what was not measured; noise (M, 3): standard deviation of each axis
     at rest (None: without two rest frames); release [s]: when the body is let go (None: not known); placement: the
-    body's own axes -> world at rest (None: no geometry).
+    body's own axes -> world at rest (None: no geometry); unsteady [s]: how long after the release it is not compared.
     """
 
     name: str
@@ -65,6 +65,7 @@ class Run:
     noise: np.ndarray | None
     release: float | None
     placement: Placement | None
+    unsteady: float = 0.0
 
     @property
     def axes(self) -> np.ndarray:

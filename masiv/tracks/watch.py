@@ -94,7 +94,7 @@ def body_run(
     """``run`` from ``skip`` to ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises
     InputError."""
     if not skip < duration:
-        raise InputError(f"tracks.skip {skip:g} s leaves nothing of tracks.duration {duration:g} s")
+        raise InputError(f"run {run.name}: unsteady: {skip:g} s leaves nothing of tracks.duration {duration:g} s")
     if run.release is None:
         raise InputError(f"{tracks.path}: run {run.name}: nobody knows when it was let go: give rest_frames")
     body = simulated_body(tracks, run, config, particle_spacing=spacing)
@@ -127,9 +127,11 @@ class BodySimulation:
         known: Mapping[str, float] | None = None,
         horizons: Sequence[float] = (),
         folder: Path | None = None,
+        whole: Sequence[BodyRun] = (),
     ) -> None:
-        """runs: see ``body_run``; horizons [s]:
-        after which a search may stop to look; folder: where rollouts are kept, which are many and long."""
+        """runs: see ``body_run``; horizons [s]: after which a search may stop to look; folder: where rollouts are kept,
+        which are many and long; whole: the runs with the moments that they leave out, where they do."""
+        self.whole: Sequence[BodyRun] = tuple(whole)
         self.horizons = tuple(horizons)
         self.folder = folder
         self.tracks = tracks
@@ -236,7 +238,7 @@ class BodySimulation:
     def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
         """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
         both = {**self.known, **values}
-        lift = values.get(f"lift@{run.name}", 0.0)
+        lift = values.get(f"lift@{run.name}", 0.0) if run.skip else 0.0
         key = (
             run.name,
             float(run.times[-1]),
@@ -350,11 +352,14 @@ class BodySimulation:
         return None
 
     def early(self, base: Fitted) -> Sequence[BodySimulation]:
-        """The first moments, then ever more, where the residual is as large as the swing: then the phase is lost."""
+        """The first moments, then ever more, where the residual is as large as the swing: then the phase is lost.
+
+        Those that are left out are in it, unsteady as they are: the phase counts from there, and an effective start
+        would make up for any frequency."""
         swing = [run.observed - run.observed.mean(0) for run in self.experiments if run.fitted]
         if base.fit_mm < LOST * rms_mm(swing):
             return ()
-        runs = [run for run in self.experiments if run.fitted]
+        runs = [run for run in self.whole or self.experiments if run.fitted]
         return [self.over([shortened(run, horizon) for run in runs]) for horizon in self.horizons]
 
     def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
@@ -369,6 +374,6 @@ LAW_NAMES = frozenset({"youngs_modulus", "poissons_ratio", "yield_stress", "fric
 
 
 def shortened(run: BodyRun, duration: float) -> BodyRun:
-    """The first ``duration`` [s] of a run."""
-    kept = run.times <= duration
+    """The first ``duration`` [s] of what is compared of a run."""
+    kept = run.times <= run.skip + duration
     return replace(run, times=run.times[kept], observed=run.observed[kept], sigma=run.sigma[kept])
