@@ -214,9 +214,12 @@ def main() -> None:
             key = f"{scene.name}/{case.name} on {other.name}"
             if key not in done:
                 base = base_run(dataclasses.replace(case, scene=other), o.out, o.preset, o.fit_frames)
-                found = unseen(Twin.load(o.out / scene.name / case.name), base, other)
-                keep(results, rows, {"case": key, "what": "unseen", "scene": scene.name, "law": law, "on": other.name,
-                                     "seed": seed, "settings": list(case.settings), **found})  # fmt: skip
+                learnt = Twin.load(o.out / scene.name / case.name)
+                found = unseen(learnt, base, other)
+                keep(results, rows, {
+                    "case": key, "what": "unseen", "scene": scene.name, "law": law, "fitted": learnt.law.kind,
+                    "on": other.name, "seed": seed, "settings": list(case.settings), **found,
+                })  # fmt: skip
     print(tables(rows))
 
 

@@ -85,7 +85,7 @@ def unseen_table(rows: list[Mapping[str, Any]]) -> str:
     for row in rows:
         found = row["after contact"]
         lines.append(
-            f"| {row['law']} | {row['scene']} | {row['on']} | {found['chamfer_1e3mm2']:.3f} ({row['floor']:.3f}) "
+            f"| {row['fitted']} | {row['scene']} | {row['on']} | {found['chamfer_1e3mm2']:.3f} ({row['floor']:.3f}) "
             f"| {found['tracked_error_mm']:.1f} |"
         )
     return "\n".join(lines)
