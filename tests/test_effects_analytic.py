@@ -228,6 +228,14 @@ def test_restitution_frees_what_sticky_ground_keeps():
     assert freed.min() > 0.1
 
 
+def test_a_force_is_periodic_when_it_has_come_round():
+    shaken = effects()["periodic_force"]
+    theta = torch.tensor([1.0, 0, 0, 0, 0, 0, 2.0])
+    assert shaken.unseen(theta, 0.6) is None
+    assert "no whole period of 2 Hz" in shaken.unseen(theta, 0.4)
+    assert effects()["linear_drag"].unseen(torch.tensor([1.0]), 0.01) is None
+
+
 @torch.enable_grad()
 def test_ground_height_and_time_offset_hand_their_shift_to_the_caller():
     x = body()

@@ -87,6 +87,10 @@ class Effect(ABC):
         """Why values of ``shared`` (P,) cannot be, given what is known of the body and the medium."""
         return None
 
+    def unseen(self, theta: torch.Tensor, watched: float) -> str | None:
+        """Why parameters (P,) do not deserve the effect's name after ``watched`` seconds of motion, or None."""
+        return None
+
     def node_velocity(self) -> Callable[..., Any]:
         """Taichi function (x, v, held, t, dt, dx, c) -> v, see ``masiv.kernels.effects.NodeKernels``. For those
         with ``on_grid``."""

@@ -37,6 +37,13 @@ class PeriodicForce(Effect):
     def coefficients(self, theta, setting):
         return torch.cat([theta[:6], 2 * math.pi * theta[6:]])
 
+    def unseen(self, theta, watched):
+        """What has not come round once is a force that changes, and nothing says that it is periodic."""
+        frequency = float(theta[6])
+        if frequency * watched >= 1:
+            return None
+        return f"no whole period of {frequency:.2g} Hz was seen in {watched:.2g} s"
+
     def guesses(self, setting):
         """From half a period in the film to two frames a period, closer together where a force moves a body most."""
         low, high = 0.5 / setting.duration, 0.5 / setting.frame_time

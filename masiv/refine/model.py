@@ -136,8 +136,12 @@ class Simulation:
         return []
 
     def objections(self, before, after, term, config) -> list[str]:
-        """None but those of the loop."""
-        return []
+        """Where the motion was not watched for long enough to give ``term`` its name."""
+        effect = effect_named(term.effect)
+        theta = torch.tensor([after.values[p.name] for p in term.parameters])
+        watched = max((e.fitted - 1) / e.problem.scene.fps for e in self.experiments)
+        reason = effect.unseen(theta, watched)
+        return [] if reason is None else [reason]
 
     @torch.no_grad()
     def positions(self, model: Model, values: Mapping[str, float], index: int, frames: int) -> torch.Tensor:
