@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 ARCH ?= cpu
 # Plain `torch` on Linux brings gigabytes of CUDA; the CPU index has the same version without. Set TORCH_INDEX= to have the former.
+# Torch is installed first and alone, so that nothing else is looked for there.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 EXTRA_INDEX = $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 BIN = $(VENV)/bin
@@ -16,7 +17,8 @@ install: $(INSTALLED)
 $(INSTALLED): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --retries 1 --upgrade pip
-	$(BIN)/python -m pip install --quiet --retries 1 $(EXTRA_INDEX) -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --retries 1 $(EXTRA_INDEX) -c constraints.txt --no-deps torch
+	$(BIN)/python -m pip install --quiet --retries 1 -c constraints.txt -e '.[dev]'
 	touch $@
 
 demo: $(INSTALLED)
