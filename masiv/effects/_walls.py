@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import functools
-
 import taichi as ti
 import torch
 
+from masiv.effects._planes import OfPlanes, with_planes
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import Effect, EffectParameter
 
 
 def _sliding(planes):
@@ -24,7 +22,7 @@ def _sliding(planes):
     return slid
 
 
-class Walls(Effect):
+class Walls(OfPlanes):
     """v · n_p = 0 in {x : n_p · x ≤ h_p}, for each plane p: a wall that matter slides along and does not leave, which
     is a plane of symmetry as well. Its parameters are constants: n_p and h_p of each plane.
 
@@ -33,28 +31,12 @@ class Walls(Effect):
 
     name = "walls"
     looks_like = "a part of the body slides along a wall"
-    strengths = 0
-    on_grid = "nodes"
-
-    def __init__(self, planes: int) -> None:
-        self.planes = planes
-        names = (("x", "1"), ("y", "1"), ("z", "1"), ("height", "m"))
-        self.parameters = tuple(
-            EffectParameter(f"{name}{p}", unit, -1e3, 1e3, 1e-3) for p in range(planes) for name, unit in names
-        )
 
     def node_velocity(self):
         return _sliding(self.planes)
 
 
-@functools.lru_cache(maxsize=8)
-def _walls_effect(planes: int) -> Walls:
-    """One a number of planes: kernels are compiled for the object."""
-    return Walls(planes)
-
-
 def walled(effects: ActiveEffects, normals: torch.Tensor, heights: torch.Tensor) -> ActiveEffects:
     """``effects`` with walls after them. normals (P, 3), unit, into the matter, perpendicular to each other (so that
     the order of walls in a corner does not matter); heights (P,) [m], simulation frame."""
-    planes = torch.cat([normals, heights[:, None]], dim=1).detach().reshape(-1)
-    return ActiveEffects((*effects.members, (_walls_effect(len(heights)), planes)), effects.setting)
+    return with_planes(effects, Walls, normals, heights)
