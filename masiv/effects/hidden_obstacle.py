@@ -1,12 +1,14 @@
 """Something in the way that the cameras do not see."""
 
+import numpy as np
 import taichi as ti
 import torch
 
 from masiv.effects._place import PLACE, as_guesses, spread
-from masiv.effects.effect import Effect, EffectParameter
+from masiv.effects.effect import Effect, EffectParameter, Setting
+from masiv.rigid import struck
 
-_GUESSES = 12
+_GUESSES = 11
 
 
 @ti.func
@@ -34,7 +36,8 @@ class HiddenObstacle(Effect):
         return _stopped
 
     def guesses(self, setting):
-        """Places far apart that the body reaches, or all but reaches, and where it was not at frame 0."""
+        """Where the body is first turned aside above the ground, and places far apart that it reaches, or all but
+        reaches, and where it was not at frame 0."""
         rest = setting.rest
         if setting.path is not None:
             swept = setting.path[1:].reshape(-1, 3).to(rest)
@@ -46,4 +49,14 @@ class HiddenObstacle(Effect):
         swept = swept[:: max(1, len(swept) // 4000)]
         sparse = rest[:: max(1, len(rest) // 1000)]
         clear = torch.cdist(swept, sparse).amin(1) > self.parameters[0].step
-        return as_guesses(spread(swept[clear], _GUESSES)) if clear.any() else []
+        places = [spread(swept[clear], _GUESSES)] if clear.any() else []
+        return as_guesses(torch.cat([*_struck(setting, self.parameters[0].step), *places])) if places else []
+
+
+def _struck(setting: Setting, least_height: float) -> list[torch.Tensor]:
+    """The place (1, 3) [m] where the body is first turned aside, if that is higher than ``least_height`` [m]."""
+    if setting.path is None:
+        return []
+    path = setting.path.double().numpy()
+    place = struck(path, np.arange(len(path)) * setting.frame_time, setting.gravity.double().numpy())
+    return [torch.as_tensor(place[None]).to(setting.rest)] if place is not None and place[1] > least_height else []

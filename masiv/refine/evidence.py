@@ -74,7 +74,7 @@ def objections(
     gain = before.bic(after.samples) - after.bic(after.samples)
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
-    adapts = bool(term.others) or gain < 2 * config.least_bic
+    adapts = len(term.parameters) > 1 or gain < 2 * config.least_bic
     out += explains_too_little(before, after, experiments, config, adapts=adapts)
     sigmas = sigmas_from_zero(after, term)
     if not sigmas >= config.least_sigmas:
@@ -113,7 +113,7 @@ def explains_too_little(
     Four kinds of evidence are enough: more than noise and grid could change, borne out by held-out instants; held-out
     instants that are decisive on their own; held-out instants that cannot tell, and a motion that is plain where the
     simulation is as certain as the observation; or a good part of the held-out error, for an effect that cannot adapt
-    to an error of any shape (``adapts`` False: it has no place and no frequency, and the criterion is clear).
+    to an error of any shape (``adapts`` False: it is one number, and the criterion is clear).
     """
     # Variance that it removes, over that which noise and grid would explain.
     gained = [(b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)]

@@ -124,8 +124,11 @@ class Simulation:
         return [n for n, e in library.items() if n not in apart and not (taken and e.on_grid == "ground")]
 
     def term(self, name: str) -> Term:
-        """The effect, of all that is filmed; its guesses are of the first experiment."""
-        term = plain_term(name, self.experiments[0].problem.setting())
+        """The effect, of all that is filmed; its guesses are of what may be fitted of the first experiment."""
+        first = self.experiments[0]
+        setting = first.problem.setting()
+        assert setting.path is not None
+        term = plain_term(name, replace(setting, path=setting.path[: first.fitted]))
         instead = effect_named(name).stands_for
         return replace(
             term, stands_for=() if instead is None else tuple(f"{instead}@{e.name}" for e in self.experiments)

@@ -6,13 +6,14 @@ import numpy as np
 import torch
 
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.launch import Launch, beyond_rigid, estimate_launch
+from masiv.identify.launch import Launch, estimate_launch
 from masiv.identify.problem import Motion, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Experiment
 from masiv.refine.noise import noise_floor
 from masiv.refine.observed import Observed
+from masiv.rigid import beyond_rigid
 from masiv.scene.scene import Scene
 
 LEAST_PER_CELL = 2.0

@@ -1,0 +1,65 @@
+"""Rigid motion: what leaves it, and where a flight was turned aside."""
+
+import numpy as np
+import pytest
+import torch
+
+from masiv.effects.catalogue import effect_named
+from masiv.effects.effect import Setting
+from masiv.refine.noise import noise_floor
+from masiv.rigid import beyond_rigid, beyond_uniform, flown, free_flight, struck
+
+GRAVITY = np.array([0.0, -9.8, 0.0])
+VELOCITY, OMEGA = np.array([1.2, 0.4, 0.3]), np.array([0.4, 2.0, 3.0])
+TIMES = np.arange(9) / 24
+
+
+@pytest.fixture
+def body():
+    return np.random.default_rng(1).uniform(-0.2, 0.2, (500, 3)) + np.array([0.0, 1.0, 0.0])
+
+
+@pytest.fixture
+def flight(body):
+    return np.stack([flown(body, VELOCITY, OMEGA, GRAVITY, t) for t in TIMES])
+
+
+def test_a_flight_is_found_from_its_positions(flight):
+    velocity, omega = free_flight(flight, TIMES, GRAVITY)
+    np.testing.assert_allclose(velocity, VELOCITY, atol=1e-9)
+    np.testing.assert_allclose(omega, OMEGA, atol=1e-9)
+    assert beyond_rigid(flight).max() < 1e-9
+
+
+def test_a_uniform_strain_is_not_rigid_but_uniform(flight):
+    stretched = flight.copy()
+    stretched[3] = flight[3] @ np.diag([1.1, 0.95, 1.0])
+    assert beyond_rigid(stretched)[2] > 5e-3
+    assert beyond_uniform(stretched).max() < 1e-9
+
+
+def test_a_body_that_swells_in_flight_is_not_taken_for_noise(flight):
+    noise = 1e-3 * np.random.default_rng(0).normal(size=flight.shape)
+    noise[0] = 0
+    centre = flight.mean(1, keepdims=True)
+    swollen = centre + (1 + 0.1 * np.sin(20 * TIMES))[:, None, None] * (flight - centre)
+    assert noise_floor(swollen + noise, 8) < 2.6 * noise_floor(flight + noise, 8)
+    assert np.mean(beyond_rigid(swollen)) > 10e-3
+
+
+def test_a_flight_that_is_turned_aside_shows_where(flight):
+    assert struck(flight, TIMES, GRAVITY) is None
+    centre, radius = flight[6].mean(0) + np.array([0.25, 0.0, 0.0]), 0.15
+    turned = flight.copy()
+    for frame in (6, 7, 8):  # nothing is inside of the sphere
+        arm = turned[frame] - centre
+        distance = np.linalg.norm(arm, axis=1, keepdims=True)
+        turned[frame] = centre + arm / distance * np.maximum(distance, radius)
+    turned[1:] += 1e-3 * np.random.default_rng(0).normal(size=turned[1:].shape)
+    place = struck(turned, TIMES, GRAVITY)
+    assert np.linalg.norm(place - centre) < 0.6 * radius
+
+    guesses = effect_named("hidden_obstacle").guesses(
+        Setting(torch.as_tensor(GRAVITY), torch.as_tensor(flight[0]), 0.1, 0.4, 0.4, 1 / 24, torch.as_tensor(turned))
+    )
+    np.testing.assert_allclose(guesses[0], place)
