@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +16,13 @@ from masiv.identify.families import Family, law_of, motion_of, motion_parameters
 from masiv.identify.parametric import Parameter
 from masiv.identify.problem import Motion, Problem
 from masiv.refine.simulated import Term, Weighing, effect_parameters, plain_term
+
+if TYPE_CHECKING:
+    from masiv.refine.refit import Fitted
+
+
+LOST, SHOWS = 0.25, 0.05
+"""Distance, over the size of the body, from which derivatives at the end say nothing, and from which it is plain."""
 
 
 @dataclass(frozen=True)
@@ -134,9 +142,19 @@ class Simulation:
             term, stands_for=() if instead is None else tuple(f"{instead}@{e.name}" for e in self.experiments)
         )
 
-    def early(self, base) -> list:
-        """None: a fall is short."""
-        return []
+    def early(self, base: Fitted) -> list[Simulation]:
+        """The frames until the residual shows, then half of the rest, where a body ends somewhere else altogether."""
+        horizons = []
+        for e, squares in zip(self.experiments, base.squares, strict=True):
+            away = np.sqrt(squares[: e.rows]) / e.problem.size
+            if away[-1] < LOST:
+                return []
+            shows = int(np.argmax(away > SHOWS)) // e.problem.samples + 2
+            horizons.append((min(shows + 1, e.fitted), (shows + 1 + e.fitted) // 2))
+        return [
+            Simulation([replace(e, fitted=h[k]) for e, h in zip(self.experiments, horizons, strict=True)])
+            for k in range(2)
+        ]
 
     def objections(self, before, after, term, config) -> list[str]:
         """Where the motion was not watched for long enough to give ``term`` its name."""
