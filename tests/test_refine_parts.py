@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from masiv.identify.parametric import Parameter
+from masiv.refine.add_effect import absent
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
-from masiv.refine.loop import absent
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import best_strength, leapt, strengths_alone
 from masiv.refine.simulated import Term

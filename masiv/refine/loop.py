@@ -3,34 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from masiv.errors import MasivError
+from masiv.refine.add_effect import CHORD_STEPS, refit
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import above_noise, excess, objections, simplest
 from masiv.refine.noise import uncertainties
-from masiv.refine.refit import (
-    Fitted,
-    best_strength,
-    chord_fit,
-    column,
-    full_fit,
-    held_in,
-    leapt,
-    reweighted,
-    robust_cost,
-    softness,
-    strengths_alone,
-    summarised,
-)
+from masiv.refine.refit import Fitted, full_fit, held_in, ordered, reweighted, softness, strengths_alone
 from masiv.refine.score import Candidate, alike, score
-from masiv.refine.simulated import Simulated, Term
+from masiv.refine.simulated import Simulated
 
 Say = Callable[[str, int, int, str], None]
-CHORD_STEPS = 8
 STOP_GAP = "smooth_force"
 SOFT = 5.0
 """Sizes of the noise from which a weighted residual counts as wild, at the least."""
@@ -132,14 +117,6 @@ def weigh(simulation: Simulated, fitted: Fitted) -> None:
     simulation.experiments = tuple(replace(e, sigma=s) for e, s in zip(simulation.experiments, sigma, strict=True))
 
 
-def ordered(fits: Sequence[Fitted]) -> list[Fitted]:
-    """Best first by the information criterion, at the number of samples of the fit with the least cost."""
-    if not fits:
-        return []
-    samples = min(fits, key=lambda f: f.cost).samples
-    return sorted(fits, key=lambda f: f.bic(samples))
-
-
 def _round(
     simulation: Simulated,
     current: Fitted,
@@ -233,60 +210,6 @@ def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
     budget = 8 * (len(simulation.parameters(fitted.model)) + 1)
     held = held_in(simulation, fitted)
     return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft, held=held)
-
-
-def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
-    """``base`` with the effect: strengths jointly with law and throw; then its places or frequencies as well, where
-    the information criterion asks for it. Else they are as guessed, and without a standard error."""
-    term = simulation.term(candidate.effect)
-    model = base.model.with_effect(term.name)
-    params = simulation.parameters(model)
-    names = [p.name for p in params]
-    first = [p for p in params if p not in term.others]
-    jacobian = _assembled(first, base, candidate, [p.name for p in term.strengths])
-    others = {p.name: candidate.theta[p.name] for p in term.others}
-    values = {**absent(term, base.values), **others}
-    residual = simulation.residual(model, values) if term.stands_for else base.residual
-    values, residual, jacobian = leapt(simulation, model, first, values, residual, jacobian, soft=soft)
-    values, residual, jacobian = chord_fit(
-        simulation, model, first, values, residual, jacobian, steps=CHORD_STEPS, soft=soft
-    )
-    cost = robust_cost(residual, soft)
-    if base.cost - cost < 0.5 * candidate.explained * base.cost:  # far from the promise: not linear about zero
-        start = {**absent(term, base.values), **others}
-        start |= {p.name: start[p.name] + candidate.theta[p.name] for p in term.strengths}
-        jump, jumped = best_strength(simulation, model, start, term.strengths, soft)
-        if jumped < cost:
-            return full_fit(simulation, model, jump, budget=2 * len(params) + 6, soft=soft)
-    if not others:
-        return summarised(simulation, model, params, values, jacobian, soft=soft)
-    guessed = summarised(simulation, model, first, values, jacobian, soft=soft)
-    for _ in range(2):
-        extra = [p for p in params if p.name in others]
-        wide = np.column_stack([jacobian, *[column(simulation, model, values, residual, p) for p in extra]])
-        values, residual, wide = chord_fit(
-            simulation, model, [*first, *extra], values, residual, wide, steps=CHORD_STEPS - 2, soft=soft
-        )
-        jacobian = wide[:, : len(first)]
-    order = [[*(p.name for p in first), *others].index(n) for n in names]
-    placed = summarised(simulation, model, params, values, wide[:, order], soft=soft)
-    return ordered([guessed, placed])[0]
-
-
-def absent(term: Term, values: Mapping[str, float]) -> dict[str, float]:
-    """``values`` for a model with ``term`` that moves as the one without did: no strength, or that of what it stands
-    for."""
-    out = {**values, **{p.name: 0.0 for p in term.strengths}}
-    known = [values[name] for name in term.stands_for if name in values]
-    if known:
-        out[term.strengths[0].name] = sum(known) / len(known)
-    return out | dict.fromkeys(term.stands_for, 0.0)
-
-
-def _assembled(first, base: Fitted, candidate: Candidate, strengths: list[str]) -> np.ndarray:
-    known = {p.name: base.jacobian[:, k] for k, p in enumerate(base.parameters)}
-    known |= {name: candidate.columns[:, k] for k, name in enumerate(strengths)}
-    return np.stack([known[p.name] for p in first], axis=1)
 
 
 def _freed(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:

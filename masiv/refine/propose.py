@@ -8,8 +8,9 @@ import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.progress import Progress
-from masiv.refine.loop import TELLS_APART, Outcome, ordered
+from masiv.refine.loop import TELLS_APART, Outcome
 from masiv.refine.model import Simulation
+from masiv.refine.refit import ordered
 
 THROWS = (
     ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((3.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0)),

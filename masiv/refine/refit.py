@@ -48,6 +48,14 @@ class Fitted:
         return samples * math.log(max(self.cost, 1e-300)) + len(self.parameters) * math.log(samples)
 
 
+def ordered(fits: Sequence[Fitted]) -> list[Fitted]:
+    """Best first by the information criterion, at the number of samples of the fit with the least cost."""
+    if not fits:
+        return []
+    samples = min(fits, key=lambda f: f.cost).samples
+    return sorted(fits, key=lambda f: f.bic(samples))
+
+
 def softness(residual: np.ndarray) -> float:
     """Size [m] from which a residual counts as wild."""
     return max(2 * 1.4826 * float(np.median(np.abs(residual))), 1e-9)

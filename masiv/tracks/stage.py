@@ -13,9 +13,9 @@ from masiv.config import Config
 from masiv.errors import InputError, MasivError
 from masiv.identify.families import FAMILIES
 from masiv.progress import Progress, silent
-from masiv.refine.loop import Outcome, close_loop, ordered
+from masiv.refine.loop import Outcome, close_loop
 from masiv.refine.model import Model
-from masiv.refine.refit import Fitted, full_fit, rms_mm
+from masiv.refine.refit import Fitted, full_fit, ordered, rms_mm
 from masiv.tracks.fit import conditions, family_of, fit_law, only_body, ratio_of, runs_of, simulation_of
 from masiv.tracks.group import GroupRefined, baseline, refine_group
 from masiv.tracks.points import RIGID, PointRun, PointSimulation, point_runs
