@@ -12,6 +12,8 @@ from masiv.identify.parametric import Parameter
 from masiv.refine.add_effect import absent
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
+from masiv.refine.loop import in_reach
+from masiv.refine.model import Simulation
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import best_strength, leapt, strengths_alone
 from masiv.refine.simulated import Term
@@ -166,3 +168,28 @@ def test_of_causes_that_explain_as_much_thesimplest():
     uncertain = [replace(experiments[0], sigma=np.full(INSTANTS, 10 * NOISE))]
     assert simplest([rich, plain, poor], uncertain) is poor
     assert excess(fits(9, 1), experiments) == pytest.approx(3.0)
+
+
+def test_a_worse_law_is_not_fitted_with_what_would_not_make_up_for_it():
+    base = SimpleNamespace(cost=2.0)
+    trials = [SimpleNamespace(fitted=SimpleNamespace(cost=c)) for c in (1.5, 1.8)]
+    assert in_reach(SimpleNamespace(explained=0.2), base, trials)
+    assert not in_reach(SimpleNamespace(explained=0.1), base, trials)
+    assert in_reach(SimpleNamespace(explained=0.1), base, [])
+
+
+def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
+    @dataclass(frozen=True)
+    class Throw:
+        problem: SimpleNamespace
+        fitted: int = 12
+
+        @property
+        def rows(self):
+            return (self.fitted - 1) * self.problem.samples
+
+    simulation = Simulation([Throw(SimpleNamespace(size=0.5, samples=2))])
+    near = np.full(30, 1e-6)
+    assert simulation.early(SimpleNamespace(squares=[near])) == []
+    away = np.where(np.arange(30) < 12, near, 0.2**2)  # at the end of frame 6, all is well
+    assert [s.experiments[0].fitted for s in simulation.early(SimpleNamespace(squares=[away]))] == [9, 10]

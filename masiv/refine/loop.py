@@ -19,6 +19,8 @@ Say = Callable[[str, int, int, str], None]
 STOP_GAP = "smooth_force"
 SOFT = 5.0
 """Sizes of the noise from which a weighted residual counts as wild, at the least."""
+MISJUDGED = 1.5
+"""By how much a ranking, which is linear, may have judged a cause too small."""
 TELLS_APART = 6.0
 """Difference of the information criterion below which two refits explain the data equally well."""
 
@@ -142,6 +144,7 @@ def _round(
         say(label, 1, 1, candidates[0].effect if candidates else "none")
         ranking = ranking or candidates
         worth = [c for c in candidates if c.explained >= config.least_explained][: config.shortlist]
+        worth = [c for c in worth if early or in_reach(c, base, trials)]
         for done, candidate in enumerate(worth):
             label = f"refine: fit effects, {base.model.family.kind}"
             say(label, done, len(worth), candidate.effect)
@@ -175,6 +178,13 @@ def _round(
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, confusable)
+
+
+def in_reach(candidate: Candidate, base: Fitted, trials: Sequence[Trial]) -> bool:
+    """Whether ``candidate``, should it explain MISJUDGED times what the ranking says, would be as good as the best of
+    ``trials``: a law that explains the motion worse need not be fitted with what would not make up for that."""
+    best = min((t.fitted.cost for t in trials), default=math.inf)
+    return base.cost * (1 - min(MISJUDGED * candidate.explained, 1.0)) <= best
 
 
 def _rank(trials: list[Trial]) -> None:
