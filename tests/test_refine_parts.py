@@ -103,14 +103,14 @@ def test_what_a_fit_absorbs_is_no_uncertainty():
     fitted = SimpleNamespace(jacobian=jacobian, model=None, values={})
     sizes = np.sqrt((absorbed[:ROWS] ** 2).sum(2).mean(1))
     assert (sizes > 10 * NOISE).all()
-    (sigma,) = uncertainties(Linear(jacobian, 0.0, absorbed), fitted)
+    (sigma,) = uncertainties(Linear(jacobian, 0.0, absorbed), fitted, [np.full(INSTANTS, NOISE)])
     np.testing.assert_allclose(sigma, NOISE, rtol=1e-6)
     other = 1e-2 * random.normal(size=absorbed.shape)
-    (sigma,) = uncertainties(Linear(jacobian, 0.0, other), fitted)
+    (sigma,) = uncertainties(Linear(jacobian, 0.0, other), fitted, [np.full(INSTANTS, NOISE)])
     rms = np.sqrt((other**2).sum(2).mean(1))
     assert (sigma[:ROWS] >= 0.8 * rms[:ROWS]).all()
     assert (np.diff(sigma) >= 0).all()
-    (sigma,) = uncertainties(Linear(jacobian, 0.0, None), fitted)
+    (sigma,) = uncertainties(Linear(jacobian, 0.0, None), fitted, [np.full(INSTANTS, NOISE)])
     np.testing.assert_array_equal(sigma, NOISE)
 
 

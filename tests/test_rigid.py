@@ -43,7 +43,7 @@ def test_a_body_that_swells_in_flight_is_not_taken_for_noise(flight):
     noise[0] = 0
     centre = flight.mean(1, keepdims=True)
     swollen = centre + (1 + 0.1 * np.sin(20 * TIMES))[:, None, None] * (flight - centre)
-    assert noise_floor(swollen + noise, 8) < 2.6 * noise_floor(flight + noise, 8)
+    assert noise_floor(swollen + noise, 8) < 1.7 * noise_floor(flight + noise, 8)
     assert np.mean(beyond_rigid(swollen)) > 10e-3
 
 

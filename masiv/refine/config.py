@@ -20,16 +20,15 @@ class RefineConfig(BaseModel):
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
     above_noise: float = Field(1.2, ge=0, description="residual over the noise below which nothing is looked for")
-    another: float = Field(
-        2.0, ge=0, description="residual over what noise and grid explain below which no further effect is looked for"
-    )
     tracking_error: float = Field(
         0.4, ge=0, le=1,
         description="how far points that are followed in pictures are off, over how far they left a rigid motion",
     )  # fmt: skip
     unexplained: float = Field(
-        3.0, ge=1, description="residual over the same floor from which it is called unexplained, not nothing"
-    )
+        2.0, ge=1,
+        description="residual, over what noise and grid explain, from which something is missing: a further effect is "
+        "looked for, and where none is found, it is called unexplained",
+    )  # fmt: skip
     least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")
     least_gain: float = Field(0.15, ge=0, le=1, description="share of the held-out error that an effect must remove")
     decisive_gain: float = Field(

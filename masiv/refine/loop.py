@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from masiv.errors import MasivError
 from masiv.refine.add_effect import CHORD_STEPS, refit
 from masiv.refine.config import RefineConfig
@@ -64,7 +66,8 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
     """Add effects to the best of ``baselines`` (one a law, without effects) until none is confirmed, or the residual is
     near the noise. Gives the experiments of ``simulation`` their sigma."""
     least = min(baselines, key=lambda f: f.cost)
-    weigh(simulation, least)
+    observation = [e.sigma for e in simulation.experiments]
+    weigh(simulation, least, observation)
     soft = max(softness(simulation.residual(least.model, least.values)), SOFT * simulation.experiments[0].noise)
     rivals = []
     for done, base in enumerate(baselines):
@@ -73,16 +76,21 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
     rivals = ordered(rivals)[: config.families]
     before = current = rivals[0]
     rounds: list[Round] = []
-    experiments = simulation.experiments
-    while len(rounds) < config.max_effects and above_noise(current, experiments, config):
+    while len(rounds) < config.max_effects and above_noise(current, simulation.experiments, config):
         done = _round(simulation, current, rivals, soft, config, say)
         rounds.append(done)
         if done.accepted is None:
             break
         current = done.accepted.fitted
-        rivals = [current]
-        if excess(current, experiments) < config.another:
+        if excess(current, simulation.experiments) < config.unexplained:
             break
+        # With the effect the body may touch what it did not, earlier than before: what a finer grid changes is another.
+        if weigh(simulation, current, observation):
+            current = carried(simulation, current, soft)
+        rivals = [current]
+        if excess(current, simulation.experiments) < config.unexplained:
+            break
+    experiments = simulation.experiments
     left, there_was = excess(current, experiments), excess(before, experiments)
     if current is not before and left > max(config.unexplained, there_was / 2):
         for done in rounds:  # no name for what it does not explain
@@ -113,10 +121,13 @@ def stop_gap(simulation: Simulated, current: Fitted, soft: float, config: Refine
     return None if objections(current, fitted, term, simulation.experiments, config) else fitted
 
 
-def weigh(simulation: Simulated, fitted: Fitted) -> None:
-    """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves."""
-    sigma = uncertainties(simulation, fitted)
+def weigh(simulation: Simulated, fitted: Fitted, observation: Sequence[np.ndarray]) -> bool:
+    """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves; ``observation`` is its part of it. Whether
+    any is another than it was."""
+    sigma = uncertainties(simulation, fitted, observation)
+    same = all(np.array_equal(e.sigma, s) for e, s in zip(simulation.experiments, sigma, strict=True))
     simulation.experiments = tuple(replace(e, sigma=s) for e, s in zip(simulation.experiments, sigma, strict=True))
+    return not same
 
 
 def _round(
@@ -136,7 +147,7 @@ def _round(
         if ranking and not names:
             break
         early = simulation.early(base)
-        start = base if not early else _carried(early[0], base, soft)
+        start = base if not early else carried(early[0], base, soft)
         candidates = score(
             early[0] if early else simulation, start, soft=soft, names=names or config.effects or None,
             progress=lambda n, i, k, label=label: say(label, i, k, n),
@@ -151,7 +162,7 @@ def _round(
             try:
                 fitted = refit(early[0] if early else simulation, start, candidate, soft)
                 for longer in (*early[1:], simulation) if early else ():
-                    fitted = _carried(longer, fitted, soft)
+                    fitted = carried(longer, fitted, soft)
                 trials.append(Trial(candidate, fitted))
             except MasivError as failed:
                 say(label, done, len(worth), f"{candidate.effect}: {failed}")
@@ -215,7 +226,7 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
         trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
 
 
-def _carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
+def carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
     """``fitted`` as a start in another simulation of the same experiments."""
     budget = 8 * (len(simulation.parameters(fitted.model)) + 1)
     held = held_in(simulation, fitted)

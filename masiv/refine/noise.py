@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from masiv.refine.refit import Fitted
 from masiv.refine.simulated import Simulated
 from masiv.rigid import beyond_rigid, beyond_uniform
 
-UNIFORM = 2.5
+UNIFORM, USUAL = 2.5, 1.4
 """How many times farther than from the best affine map errors of the observation are from the best rigid motion, at
-most (1.0 to 2.5 in every frame of flight of eleven scenes followed in pictures, 1.2 to 2.2 in simulated noise)."""
+most and usually (1.0 to 2.5 in flights of eleven scenes followed in pictures, 1.2 to 2.2 in simulated noise)."""
 
 
 def noise_floor(positions: np.ndarray, last_frame: int) -> float:
@@ -23,12 +25,13 @@ def noise_floor(positions: np.ndarray, last_frame: int) -> float:
     over the body they are taken to be as large again. Where the body touches at once, frame 1 has to do.
     """
     flight = positions[: max(2, last_frame)]
-    return float(np.sqrt(2 * np.mean(np.minimum(beyond_rigid(flight), UNIFORM * beyond_uniform(flight)) ** 2)))
+    rigid, uniform = beyond_rigid(flight), beyond_uniform(flight)
+    return float(np.sqrt(2 * np.mean(np.where(rigid > UNIFORM * uniform, USUAL * uniform, rigid) ** 2)))
 
 
-def uncertainties(simulation: Simulated, fitted: Fitted) -> list[np.ndarray]:
+def uncertainties(simulation: Simulated, fitted: Fitted, observation: Sequence[np.ndarray]) -> list[np.ndarray]:
     """For each experiment, the root mean square distance (K,) [m] by which model and observation may differ at each
-    instant with nothing missing: their sigma so far, of the observation, and what a finer grid changes and no fit could
+    instant with nothing missing: that of the ``observation`` (K,), and what a finer grid changes and no fit could
     absorb. In free flight that is nothing.
 
     What a fit absorbs is the change's part along the derivatives of ``fitted``; after the fitted instants, the same
@@ -42,8 +45,11 @@ def uncertainties(simulation: Simulated, fitted: Fitted) -> list[np.ndarray]:
         changes.append(np.zeros((experiment.instants, 1, 1)) if change is None else change)
     whole = [np.sqrt((change**2).sum(2).mean(1)) for change in changes]
     if not any(size.any() for size in whole):
-        return [e.sigma for e in experiments]
-    weights = [e.noise / np.hypot(e.sigma, np.maximum.accumulate(s)) for s, e in zip(whole, experiments, strict=True)]
+        return list(observation)
+    weights = [
+        e.noise / np.hypot(seen, np.maximum.accumulate(size))
+        for size, seen, e in zip(whole, observation, experiments, strict=True)
+    ]
     rows = [c[: e.rows] * w[: e.rows, None, None] for c, w, e in zip(changes, weights, experiments, strict=True)]
     counts = [part.size for part in rows]
     # The derivatives are weighted by the sigma so far.
@@ -54,11 +60,11 @@ def uncertainties(simulation: Simulated, fitted: Fitted) -> list[np.ndarray]:
     flat = np.concatenate([part.ravel() for part in rows])
     left = flat - jacobian @ (np.linalg.lstsq(jacobian / scale, flat, rcond=1e-8)[0] / scale)
     out = []
-    for part, size, weight, experiment, mine in zip(
-        rows, whole, weights, experiments, np.split(left, np.cumsum(counts)[:-1]), strict=True
+    for part, size, weight, experiment, seen, mine in zip(
+        rows, whole, weights, experiments, observation, np.split(left, np.cumsum(counts)[:-1]), strict=True
     ):
         kept = np.sqrt((mine.reshape(part.shape) ** 2).sum(2).mean(1)) / weight[: experiment.rows]
         share = min(float(kept[-1] / max(size[experiment.rows - 1], 1e-300)), 1.0)
         grid = np.concatenate([np.minimum(kept, size[: experiment.rows]), share * size[experiment.rows :]])
-        out.append(np.hypot(experiment.sigma, np.maximum.accumulate(grid)))
+        out.append(np.hypot(seen, np.maximum.accumulate(grid)))
     return out
