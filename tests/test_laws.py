@@ -1,5 +1,6 @@
 """Constitutive laws: what must hold whatever the weights are, kernels against definitions, analytic cases."""
 
+import copy
 import itertools
 import math
 
@@ -327,6 +328,19 @@ def test_pretrained_law_resembles_its_material(material, squeeze):
     assert pressures[1] == pytest.approx(pressures[0], rel=0.15 if material == "sand" else 0.06)
     if material != "sand":
         assert float((states[0] - states[1]).norm() / states[0].norm()) < 0.05
+
+
+def test_departure_counts_every_strain_and_no_scale():
+    law = NeuralLaw(seed=3).double()
+    scaled, other = copy.deepcopy(law), copy.deepcopy(law)
+    with torch.no_grad():
+        scaled.log_stress_scale += 2.0
+        scaled.log_flow_strain -= 1.0
+        other.elastic[-1].bias[2] += 0.5  # a bulk modulus e^0.5 times as large, at all strains
+    assert float(law.departure(law)) == float(scaled.departure(law)) == 0.0
+    assert float(other.departure(law)) == pytest.approx(0.5**2 / 4)
+    (slope,) = torch.autograd.grad(other.departure(law), other.elastic[-1].bias)
+    torch.testing.assert_close(slope, torch.tensor([0.0, 0.0, 0.25, 0.0], dtype=torch.float64))
 
 
 def test_laws_survive_saving(tmp_path):

@@ -53,7 +53,7 @@ def fit(
     the least error over all frames. Raises MasivError.
     """
     config = problem.config
-    law = copy.deepcopy(law)
+    start, law = law, copy.deepcopy(law)
     motion = Motion(*(t.detach().clone().requires_grad_() for t in motion.tensors()))
     if isinstance(law, NeuralLaw):
         scales = [law.log_stress_scale, law.log_flow_strain]
@@ -90,6 +90,8 @@ def fit(
             silhouette = _silhouette(problem, positions, frames, seed, i)
             geometry = error if config.geometry_loss == "trajectory" else problem.geometry_error(positions)
             loss = config.trajectory_weight * geometry / problem.size + config.silhouette_weight * silhouette
+            if isinstance(law, NeuralLaw) and isinstance(start, NeuralLaw) and config.prior_weight:
+                loss = loss + config.prior_weight * law.departure(start)
             if frames == problem.frames:
                 _keep_better(best, problem, positions, law, motion)
             loss.backward()

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 STRAIN_SCALE = 0.02
 LOG_MODULUS_RANGE = 6.0
+EVERY = 5
+"""Of the lattice's nodes, every which one ``departure`` looks at: no count of the lattice is a multiple of it."""
 LOG_RATE_RANGE = 14.0  # relaxation rates of e^-14 to e^14 per second
 
 
@@ -119,6 +121,15 @@ class NeuralLaw(Law):
         j, b, b_inverse, eye = _isochoric(deformation_gradient)
         pressure = 0.5 * kappa * (j - 1 / j) + coupling * (_trace(b) - 3)
         return g1 * _deviator(b) - g2 * _deviator(b_inverse) + pressure * eye
+
+    def departure(self, other: NeuralLaw) -> torch.Tensor:
+        """Mean square difference () of the networks' outputs (log moduli relative to the stress scale, coupling, log
+        rates) from those of ``other`` over the lattice of strain features; the two scales do not count."""
+        nodes = table.nodes(self.log_stress_scale.dtype)[::EVERY]
+        with torch.no_grad():
+            were = other.elastic(nodes), other.plastic(nodes)
+        now = self.elastic(nodes), self.plastic(nodes)
+        return sum(((a - b).square().mean() for a, b in zip(now, were, strict=True)), torch.zeros(()))
 
     def wave_modulus(self) -> float:
         with torch.no_grad():
