@@ -221,7 +221,7 @@ def load(source: Path, youngs: float, viscosity: float, particles: int, courant:
         settings = TracksConfig(particles=particles, duration=0.6)
         simulation = simulation_of(tracks, "load52", settings, config, known=law)
         effects = ("viscosity",) if name == "nothing" else ("viscosity", name)
-        values = {f"{name}.{n}": float(v) for n, v in begins[name].items()} | {"lift@load52_a": -0.006}
+        values = {f"{name}.{n}": float(v) for n, v in begins[name].items()}
         held: frozenset[str] = frozenset()
         if name != "nothing":
             place = max(simulation.term(name).guesses, key=lambda guess: guess[2])  # along the body, from the clamp

@@ -18,15 +18,18 @@ from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig
+from masiv.refine.add_effect import refit
 from masiv.refine.config import RefineConfig
 from masiv.refine.loop import close_loop
 from masiv.refine.model import Model
 from masiv.refine.refit import full_fit
+from masiv.refine.score import score
 from masiv.tracks.bent import across, bent
 from masiv.tracks.body import simulated_body, simulated_markers
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.fit import family_of, fit_law, simulation_of
 from masiv.tracks.read import read_tracks
+from masiv.tracks.watch import BodySimulation
 
 pytestmark = pytest.mark.usefixtures("taichi")
 YOUNGS, RATIO, VISCOSITY, LOAD = 2e5, 0.2, 150.0, 0.04
@@ -168,10 +171,43 @@ def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
     seen = simulation.markers(replace(run, fitted=True), model, named)
     plain = simulation.markers(replace(run, fitted=True), model, dict.fromkeys(named, 0.0))
     assert np.abs(seen - plain).max() > 2e-3
-    found = simulation._start(replace(run, observed=seen), model, {})
-    for name, value in named.items():
-        step = next(p.step for p in run.starts if p.name == name)
-        assert found[name] == pytest.approx(value, abs=0.2 * step), name
+    found, markers = simulation.found_start(replace(run, observed=seen), model, {})
+    for p, value in zip(run.starts, found, strict=True):
+        assert value == pytest.approx(named[p.name], abs=0.2 * p.step), p.name
+    np.testing.assert_allclose(markers, seen, atol=1e-5)
+    # That of a fitted run is found, too, and not among what is fitted.
+    assert not simulation.parameters(model)
+    assert full_fit(simulation, model, {}, budget=4).fit_mm < 0.1
+
+
+def test_load_is_found_where_the_release_is_not_seen(bar):
+    """Out of phase, and with no first moments to count from: from none, its derivative would lead elsewhere."""
+    known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
+    fitted = tuple(replace(run, unsteady=0.04) for run in bar.runs if run.purpose == "fit")
+    simulation = simulation_of(replace(bar, runs=fitted), "load", TRACKS, SIMULATOR, known=known)
+    term = simulation.term("point_mass")
+    places = tuple(sorted(term.guesses, key=lambda place: place[2]))  # along the bar, from the clamp
+    few = replace(term, guesses=(places[0], places[-1]))
+    simulation.term = lambda name: few if name == "point_mass" else BodySimulation.term(simulation, name)
+    base = full_fit(simulation, Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",)), {}, budget=4)
+    assert simulation.lost(base)
+    assert not simulation.early(base)
+    (found,) = score(simulation, base, soft=1e-3, names=["point_mass"])
+    assert found.finite
+    after = refit(simulation, base, found, 1e-3)
+    assert after.values["point_mass.z"] == places[-1][2]
+    assert after.values["point_mass.mass"] == pytest.approx(LOAD, rel=0.1)
+    assert after.fit_mm < 0.2 < 0.1 * base.fit_mm
+
+
+def test_what_acts_on_the_matter_at_a_place_is_in_the_body(bar):
+    simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known={})
+    particles = simulation.experiments[0].body.particles.numpy()
+    for name in ("point_mass", "point_force"):
+        for p, low, high in zip(simulation.term(name).others, particles.min(0), particles.max(0), strict=True):
+            assert (p.lower, p.upper) == pytest.approx((low, high))
+    beside = simulation.term("hidden_obstacle").parameters[-1]
+    assert beside.upper > particles.max(0)[2] + 0.01
 
 
 @pytest.fixture

@@ -70,6 +70,8 @@ class Effect(ABC):
     on_held: ClassVar[bool] = False
     """Whether it acts on a body that is held somewhere: on a free one it is nothing but another effect."""
 
+    inside: ClassVar[bool] = False
+    """Whether its place is in the body: it acts on the matter that is there."""
     stands_for: ClassVar[str | None] = None
     """What of every throw is fitted for want of this effect, and no longer beside it."""
 

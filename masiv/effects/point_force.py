@@ -18,6 +18,7 @@ class PointForce(Effect):
     parameters = (*(EffectParameter(f"force_{axis}", "N", -1e4, 1e4, 1.0) for axis in "xyz"), *PLACE)
     strengths = 3
     on_held = True
+    inside = True
 
     def force(self, theta, setting):
         return shares(setting.rest, theta[3:6], setting.size / 8)[:, None] * theta[:3]

@@ -17,6 +17,7 @@ class PointMass(Effect):
 
     name = "point_mass"
     looks_like = "the body turns about a point that is not its middle, and swings round its heavy end"
+    inside = True
     parameters = (EffectParameter("mass", "kg", 0.0, 1000.0, 1.0), *PLACE)
 
     def mass_factor(self, theta, setting):

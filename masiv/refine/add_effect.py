@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from masiv.errors import NonFiniteError
 from masiv.refine.refit import (
     Fitted,
     best_strength,
@@ -21,26 +22,34 @@ from masiv.refine.score import Candidate
 from masiv.refine.simulated import Simulated, Term
 
 CHORD_STEPS = 8
+BETWEEN = (0.5, 0.7, 1.0, 1.4, 2.0)
+"""Of a strength that was tried among a few far apart."""
+
+
+SHORT = 0.5
+"""Share of what the linear model promised below which a refit fell short of it: the effect is not linear about zero."""
 
 
 def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
     """``base`` with the effect: strengths jointly with law and throw; then its places or frequencies as well, where
-    the information criterion asks for it. Else they are as guessed, and without a standard error."""
+    the information criterion asks for it. Else they are as guessed, and without a standard error.
+
+    Where that falls short of the promise, the effect is begun at the candidate's rivals too, and the best goes on."""
+    if candidate.finite:
+        return _from_strengths(simulation, base, candidate, soft)
     term = simulation.term(candidate.effect)
     model = base.model.with_effect(term.name)
     params = simulation.parameters(model)
     names = [p.name for p in params]
     first = [p for p in params if p not in term.others]
-    jacobian = _assembled(first, base, candidate, [p.name for p in term.strengths])
+    cost, values, residual, jacobian = _as_guessed(simulation, base, candidate, soft)
+    if _falls_short(base, candidate, cost):
+        for rival in candidate.rivals:
+            other = _as_guessed(simulation, base, rival, soft)
+            if other[0] < cost:
+                candidate, (cost, values, residual, jacobian) = rival, other
     others = {p.name: candidate.theta[p.name] for p in term.others}
-    values = {**absent(term, base.values), **others}
-    residual = simulation.residual(model, values) if term.stands_for else base.residual
-    values, residual, jacobian = leapt(simulation, model, first, values, residual, jacobian, soft=soft)
-    values, residual, jacobian = chord_fit(
-        simulation, model, first, values, residual, jacobian, steps=CHORD_STEPS, soft=soft
-    )
-    cost = robust_cost(residual, soft)
-    if base.cost - cost < 0.5 * candidate.explained * base.cost:  # far from the promise: not linear about zero
+    if _falls_short(base, candidate, cost):
         start = {**absent(term, base.values), **others}
         start |= {p.name: start[p.name] + candidate.theta[p.name] for p in term.strengths}
         jump, jumped = best_strength(simulation, model, start, term.strengths, soft)
@@ -59,6 +68,47 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
     order = [[*(p.name for p in first), *others].index(n) for n in names]
     placed = summarised(simulation, model, params, values, wide[:, order], soft=soft)
     return ordered([guessed, placed])[0]
+
+
+def _as_guessed(
+    simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
+) -> tuple[float, dict[str, float], np.ndarray, np.ndarray]:
+    """Strengths fitted jointly with what ``base`` fits, places as the candidate has them: cost [m^2], values, residual,
+    and jacobian of these."""
+    term = simulation.term(candidate.effect)
+    model = base.model.with_effect(term.name)
+    first = [p for p in simulation.parameters(model) if p not in term.others]
+    jacobian = _assembled(first, base, candidate, [p.name for p in term.strengths])
+    values = {**absent(term, base.values), **{p.name: candidate.theta[p.name] for p in term.others}}
+    residual = simulation.residual(model, values) if term.stands_for else base.residual
+    values, residual, jacobian = leapt(simulation, model, first, values, residual, jacobian, soft=soft)
+    values, residual, jacobian = chord_fit(
+        simulation, model, first, values, residual, jacobian, steps=CHORD_STEPS, soft=soft
+    )
+    return robust_cost(residual, soft), values, residual, jacobian
+
+
+def _from_strengths(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
+    """The best fit from strengths of the candidate and of its rivals that were tried through the rollout, the places
+    held as they have them. Raises NonFiniteError where all diverge."""
+    term = simulation.term(candidate.effect)
+    model = base.model.with_effect(term.name)
+    held = frozenset(p.name for p in term.others)
+    budget = 4 * (len(simulation.parameters(model)) - len(held) + 1)
+    fits, failed = [], None
+    for at in (candidate, *candidate.rivals):
+        try:
+            start, _ = best_strength(simulation, model, {**base.values, **at.theta}, term.strengths, soft, BETWEEN)
+            fits.append(full_fit(simulation, model, start, budget=budget, soft=soft, held=held))
+        except NonFiniteError as error:
+            failed = error
+    if failed is not None and not fits:
+        raise failed
+    return min(fits, key=lambda f: f.cost)
+
+
+def _falls_short(base: Fitted, candidate: Candidate, cost: float) -> bool:
+    return base.cost - cost < SHORT * candidate.explained * base.cost
 
 
 def absent(term: Term, values: Mapping[str, float]) -> dict[str, float]:

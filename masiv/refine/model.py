@@ -156,6 +156,10 @@ class Simulation:
             for k in range(2)
         ]
 
+    def lost(self, base) -> bool:
+        """Never: a fall is short."""
+        return False
+
     def objections(self, before, after, term, config) -> list[str]:
         """Where the motion was not watched for long enough to give ``term`` its name."""
         effect = effect_named(term.effect)

@@ -202,12 +202,13 @@ def strengths_alone(
 
 
 def best_strength(
-    simulation: Simulated, model: Model, values: Mapping[str, float], strengths: Sequence[Parameter], soft: float
-) -> tuple[dict[str, float], float]:
-    """``values`` with the ``strengths`` at the best of some multiples of theirs, all else as it is; and its cost [m^2]:
-    what contact does has kinks, and derivatives about zero may not say where it begins to matter."""
+    simulation: Simulated, model: Model, values: Mapping[str, float], strengths: Sequence[Parameter], soft: float,
+    multiples: Sequence[float] = MULTIPLES,
+) -> tuple[dict[str, float], float]:  # fmt: skip
+    """``values`` with the ``strengths`` at the best of some ``multiples`` of theirs, all else as it is; and its cost
+    [m^2]: what contact does has kinks, and derivatives about zero may not say where it begins to matter."""
     best, least = dict(values), math.inf
-    for times in MULTIPLES:
+    for times in multiples:
         scaled = {p.name: float(np.clip(times * values[p.name], p.lower, p.upper)) for p in strengths}
         try:
             cost = robust_cost(simulation.residual(model, {**values, **scaled}), soft)
@@ -223,8 +224,10 @@ def reweighted(simulation: Simulated, base: Fitted, *, steps: int, soft: float) 
     params = started(simulation.parameters(base.model), base.values)
     values = dict(base.values)
     residual = simulation.residual(base.model, values)
-    for take in (steps, 0):
-        jacobian = np.stack([column(simulation, base.model, values, residual, p) for p in params], axis=1)
+    for take in (steps, 0) if params else (0,):
+        jacobian = np.zeros((len(residual), len(params)))
+        for k, p in enumerate(params):
+            jacobian[:, k] = column(simulation, base.model, values, residual, p)
         if take:
             values, residual, _ = chord_fit(
                 simulation, base.model, params, values, residual, jacobian, steps=take, soft=soft
@@ -287,6 +290,10 @@ def full_fit(
     parameters that stay as they are."""
     params = started([p for p in simulation.parameters(model) if p.name not in held], values)
     still = {name: values[name] for name in held}
+    if not params:
+        found = simulation.residual(model, still)
+        none = np.zeros((len(found), 0))
+        return summarised(simulation, model, params, still, none, soft=soft or softness(found))
     estimate = fit_parameters(
         lambda v: simulation.residual(model, {**still, **v}), params,
         max_evaluations=budget, robust=True, tolerance=LEAST_GAIN,

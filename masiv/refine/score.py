@@ -8,23 +8,30 @@ S is the explained share, the least-squares coefficient the strength (Rao's scor
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.identify.parametric import robust_weight
-from masiv.refine.refit import Fitted, free_parameters
+from masiv.refine.refit import Fitted, free_parameters, robust_cost
 from masiv.refine.simulated import Simulated, Term
 
 AS_MUCH = 0.02
 """Difference of explained shares that is none."""
+FINITE = (4.0, 16.0, 64.0)
+"""Strengths, in steps, that are tried where derivatives at none point nowhere."""
+NEARLY = 0.1
+"""Difference of explained shares that a refit may reverse: shares are of a linear model."""
+RIVALS = 2
 
 
 @dataclass(frozen=True)
 class Candidate:
     """An effect as the ranking sees it. explained: share of the residual, 0…1. theta: all its parameters; columns
-    (M, strengths): sensitivities at ``theta``'s places; pattern (M,): what it explains, unit length, weighted."""
+    (M, strengths): sensitivities at ``theta``'s places; pattern (M,): what it explains, unit length, weighted. rivals:
+    the same effect at other guesses that promise nearly as much, best first. finite: ``explained`` is no promise of a
+    linear model, but what ``theta`` did explain through the rollout; there are no columns then."""
 
     effect: str
     explained: float
@@ -32,6 +39,8 @@ class Candidate:
     stderr: dict[str, float]
     columns: np.ndarray
     pattern: np.ndarray
+    rivals: tuple[Candidate, ...] = ()
+    finite: bool = False
 
 
 def score(
@@ -42,20 +51,28 @@ def score(
     names: list[str] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Candidate]:
-    """Every cause that ``base`` lacks, best explained first. names: only these, of all effects."""
+    """Every cause that ``base`` lacks, best explained first. names: only these, of all effects.
+
+    Where ``base`` is out of phase with what was observed, a derivative says nothing of a strength that would bring it
+    into phase: some finite strengths of each guess are rolled out instead."""
     weight = robust_weight(base.residual, soft)
     weighted = base.jacobian * weight[:, None]
     # What is held at a bound that the descent would cross absorbs nothing more.
     free = free_parameters(base.parameters, base.values, -weighted.T @ (base.residual * weight))
     nuisance = _basis(weighted[:, free])
     left = _without(nuisance, base.residual * weight)
-    found = []
+    found, lost = [], simulation.lost(base)
     todo = [n for n in (names or simulation.candidates(base.model)) if n not in base.model.effects]
     for done, name in enumerate(todo):
         if progress is not None:
             progress(name, done, len(todo))
         term = simulation.term(name)
-        tried = [_tried(simulation, base, term, guess, weight, nuisance, left) for guess in term.guesses]
+        tried = []
+        for guess in term.guesses:
+            linear = None
+            if not lost or len(term.strengths) > 1:
+                linear = _tried(simulation, base, term, guess, weight, nuisance, left)
+            tried.append(_finite(simulation, base, term, guess, linear, soft) if lost else linear)
         known = [t for t in tried if t is not None]
         if known:
             found.append(_least(known, term))
@@ -66,10 +83,14 @@ def _least(tried: list[Candidate], term: Term) -> Candidate:
     """Of guesses that explain as much as the best one, the one that takes least: much far in may look like little far
     out, and then the data bounds a strength from below alone."""
     best = max(c.explained for c in tried)
-    return min(
+    least = min(
         (c for c in tried if c.explained >= best - AS_MUCH),
         key=lambda c: sum((c.theta[p.name] / p.step) ** 2 for p in term.strengths),
     )
+    # Of strengths that were tried, the best of a guess may lie between two: no share of these says that it is worse.
+    near = [c for c in tried if c is not least and (c.finite or c.explained >= best - NEARLY)]
+    others = sorted(near, key=lambda c: -c.explained)
+    return replace(least, rivals=tuple(others[:RIVALS]))
 
 
 def _tried(
@@ -104,6 +125,45 @@ def _tried(
         s,
         pattern / length if length > 0 else pattern,
     )
+
+
+def _finite(
+    simulation: Simulated, base: Fitted, term: Term, guess: tuple[float, ...], linear: Candidate | None, soft: float
+) -> Candidate | None:
+    """The best of some strengths, in the direction that the linear model has for it where there are several; None
+    where there is no direction, and where all rollouts diverge."""
+    steps = np.array([p.step for p in term.strengths])
+    if len(steps) == 1:
+        ways = [np.ones(1), -np.ones(1)] if term.strengths[0].lower < 0 else [np.ones(1)]
+    else:
+        way = (
+            np.zeros(len(steps)) if linear is None else np.array([linear.theta[p.name] for p in term.strengths]) / steps
+        )
+        ways = [way / np.abs(way).max()] if way.any() else []
+    model = base.model.with_effect(term.name)
+    fixed = {p.name: value for p, value in zip(term.others, guess, strict=True)}
+    best: tuple[float, dict[str, float], np.ndarray] | None = None
+    for times, way in ((times, way) for times in FINITE for way in ways):
+        strengths = {
+            p.name: float(np.clip(times * p.step * w, p.lower, p.upper))
+            for p, w in zip(term.strengths, way, strict=True)
+        }
+        try:
+            residual = simulation.residual(model, {**base.values, **strengths, **fixed})
+        except NonFiniteError:
+            continue
+        cost = robust_cost(residual, soft)
+        if best is None or cost < best[0]:
+            best = cost, {**strengths, **fixed}, residual
+    if best is None:
+        return None
+    cost, theta, residual = best
+    change = (residual - base.residual) * robust_weight(base.residual, soft)
+    return Candidate(
+        term.name, max(1 - cost / max(base.cost, 1e-300), 0.0), theta,
+        {p.name: np.inf for p in term.strengths}, np.zeros((len(residual), 0)),
+        change / max(float(np.linalg.norm(change)), 1e-300), finite=True,
+    )  # fmt: skip
 
 
 def _within_bounds(s: np.ndarray, left: np.ndarray, strengths) -> tuple[np.ndarray, np.ndarray]:

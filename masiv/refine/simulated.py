@@ -157,6 +157,10 @@ class Simulated(Protocol):
         derivatives point nowhere; none otherwise."""
         ...
 
+    def lost(self, base: Fitted) -> bool:
+        """Whether ``base`` is so far off in this simulation that derivatives at it point nowhere."""
+        ...
+
     def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
         """Reasons of its own against adding ``term``."""
         ...

@@ -16,7 +16,7 @@ from masiv.refine.model import Model
 from masiv.refine.refit import Fitted, full_fit, rms_mm
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.tracks import Body, Run, Tracks
-from masiv.tracks.watch import BodyRun, BodySimulation, body_run, shortened
+from masiv.tracks.watch import BodySimulation, body_run, shortened
 
 STIFFNESSES = 13
 """Values of the law's modulus that the first search tries, between the bounds of its family."""
@@ -55,18 +55,14 @@ def simulation_of(
     if body.geometry is None:
         raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass, to be simulated")
 
-    def made(particles: int, whole: bool) -> list[BodyRun]:
-        spacing = (body.geometry.volume / particles) ** (1 / 3)
-        return [
-            body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.unsteady)
-            for run in runs_of(tracks, condition)
-        ]
-
-    runs = made(config.particles, whole)
-    entire = made(config.particles, True) if any(run.skip for run in runs) else ()
+    spacing = (body.geometry.volume / config.particles) ** (1 / 3)
+    runs = [
+        body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.unsteady)
+        for run in runs_of(tracks, condition)
+    ]
     last = max(float(run.times[-1]) for run in runs)
     horizons = [h for k in range(16) if (h := config.search_duration * 2**k) < 0.9 * last]
-    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder, whole=entire)
+    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder)
 
 
 def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:

@@ -311,6 +311,10 @@ class PointSimulation:
         """None: a flight has no phase to lose."""
         return ()
 
+    def lost(self, base) -> bool:
+        """Never: a flight has no phase to lose."""
+        return False
+
     def _contradiction(self, fitted: Fitted, term: Term, body: str) -> str | None:
         run = next(run for run in self.experiments if run.body == body)
         theta = torch.tensor([fitted.values[p.name] for p in self.own(term, body)], dtype=torch.float64)

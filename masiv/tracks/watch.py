@@ -2,7 +2,7 @@
 
 They fulfil ``masiv.refine.simulated.Simulated``. What is fitted beside the law and the effects is when each run was let
 go, since a reader knows it to a few milliseconds, and how far aside (horizontally) it was held; those of a held-out run
-are found from its own motion.
+are found from its own motion, and so are those of a run whose first moments are left out.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
-from masiv.effects.effect import EffectParameter, Outline, Setting
+from masiv.effects.effect import Effect, EffectParameter, Outline, Setting
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.identify.parametric import Parameter
 from masiv.materials.classical import ClassicalLaw
@@ -32,6 +32,7 @@ from masiv.refine.simulated import Term, WholeRun
 from masiv.tracks.bent import across
 from masiv.tracks.body import Plan, SimulatedBody, plan, simulated_body
 from masiv.tracks.points import outline_of
+from masiv.tracks.start import found_start
 from masiv.tracks.tracks import Run, Tracks
 
 RELEASE_REACH, RELEASE_STEP = 0.03, 1e-3
@@ -127,11 +128,9 @@ class BodySimulation:
         known: Mapping[str, float] | None = None,
         horizons: Sequence[float] = (),
         folder: Path | None = None,
-        whole: Sequence[BodyRun] = (),
     ) -> None:
-        """runs: see ``body_run``; horizons [s]: after which a search may stop to look; folder: where rollouts are kept,
-        which are many and long; whole: the runs with the moments that they leave out, where they do."""
-        self.whole: Sequence[BodyRun] = tuple(whole)
+        """runs: see ``body_run``; horizons [s]: how much of what is compared a search may look at first; folder: where
+        rollouts are kept, which are many and long."""
         self.horizons = tuple(horizons)
         self.folder = folder
         self.tracks = tracks
@@ -153,10 +152,14 @@ class BodySimulation:
     # -- models -------------------------------------------------------------------------------------------------
 
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
-        """Law, release of each fitted run, effects; without what is known."""
+        """Law, release of each fitted run, effects; without what is known.
+
+        The starts of a run whose first moments are left out are not among them: they are found from it for each model,
+        as those of a held-out run are (variable projection, Golub & Pereyra 1973), since a launch, a phase and a mass
+        that are fitted side by side lead into one another's way."""
         every = [
             *model.family.parameters,
-            *(p for run in self.experiments if run.fitted for p in run.starts),
+            *(p for run in self.experiments if run.fitted and not run.skip for p in run.starts),
             *(p for name in model.effects for p in self.term(name).parameters),
         ]
         return tuple(p for p in every if p.name not in self.known)
@@ -175,13 +178,13 @@ class BodySimulation:
     def term(self, name: str) -> Term:
         """The effect, its steps in proportion to the body."""
         effect = effect_named(name)
-        own = [self._parameter(name, p) for p in effect.shared or effect.parameters]
+        own = [self._parameter(effect, p) for p in effect.shared or effect.parameters]
         cut = effect.strengths
         guesses = tuple(tuple(g) for g in effect.guesses(self._setting(self.experiments[0])))
         units = {f"{name}.{p.name}": p.unit for p in effect.shared or effect.parameters}
         return Term(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
 
-    def _parameter(self, name: str, p: EffectParameter) -> Parameter:
+    def _parameter(self, effect: Effect, p: EffectParameter) -> Parameter:
         particles = self.experiments[0].body.particles.numpy()
         low, high = particles.min(0), particles.max(0)
         size = float((high - low).max())
@@ -193,9 +196,9 @@ class BodySimulation:
         elif p.unit == "m":
             step = 0.04 * size
             if p.name in "xyz":  # a place is in the body or at it
-                k = "xyz".index(p.name)
-                lower, upper = float(low[k]) - BESIDE * size, float(high[k]) + BESIDE * size
-        return Parameter(f"{name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
+                k, reach = "xyz".index(p.name), 0.0 if effect.inside else BESIDE * size
+                lower, upper = float(low[k]) - reach, float(high[k]) + reach
+        return Parameter(f"{effect.name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
 
     def _setting(self, run: BodyRun) -> Setting:
         duration = float(run.times[-1])
@@ -297,41 +300,20 @@ class BodySimulation:
     def markers(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Markers (K, M, 3) [m, world] of the model at the run's times."""
         names = [p.name for p in run.starts]
-        own = values if run.fitted and all(name in values for name in names) else self._start(run, model, values)
-        start = np.array([own[name] for name in names])
-        path = self.path(run, model, {**values, **own})
+        if not run.fitted or not all(name in values for name in names):
+            return self.found_start(run, model, values)[1]
+        start = np.array([values[name] for name in names])
+        path = self.path(run, model, values)
         axes = self.across[: sum(not name.startswith(("release", "lift")) for name in names)]
         return path(np.clip(run.times - start[0], 0.0, None)) + start[1 : 1 + len(axes)] @ axes
 
-    def _start(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> dict[str, float]:
-        """The values of ``run.starts`` that bring a held-out run nearest to its own motion (Gauss-Newton).
+    def found_start(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        """The values of ``run.starts`` that bring it nearest to its own motion, and its markers (K, M, 3) [m]."""
 
-        The motion is nearly linear in the lift: its derivative comes from one more rollout, and a second pass is about
-        the lift of the first."""
-        starts = run.starts
-        start = np.zeros(len(starts))
-        limits = np.array([p.upper for p in starts])
-        lifts = [k for k, p in enumerate(starts) if p.name.startswith("lift")]
-        axes = self.across[: len(starts) - 1 - len(lifts)]
-        for _ in range(2 if lifts else 1):
-            about = {p.name: float(start[k]) for k, p in enumerate(starts)}
-            path = self.path(run, model, {**values, **about})
-            slope, bend, here = path.derivative(), None, start.copy()
-            for k in lifts:
-                nudged = float(start[k]) - starts[k].step * (1.0 if start[k] > 0 else -1.0)
-                other = self.path(run, model, {**values, **about, starts[k].name: nudged})
-                bend = CubicSpline(path.x, (other(path.x) - path(path.x)) / (nudged - start[k]))
-            for _ in range(8):
-                at = np.clip(run.times - start[0], 0.0, None)
-                later = -slope(at) * (run.times > start[0])[:, None, None]
-                columns = [later, *(np.broadcast_to(axis, later.shape) for axis in axes)]
-                off = path(at) + start[1 : 1 + len(axes)] @ axes - run.observed
-                if bend is not None:
-                    columns.append(bend(at))
-                    off += (start[-1] - here[-1]) * columns[-1]
-                step = np.linalg.lstsq(np.stack([c.ravel() for c in columns], axis=1), -off.ravel(), rcond=None)[0]
-                start = np.clip(start + step, -limits, limits)
-        return {p.name: float(start[k]) for k, p in enumerate(starts)}
+        def path_at(lift: float) -> CubicSpline:
+            return self.path(run, model, {**values, f"lift@{run.name}": lift})
+
+        return found_start(run.starts, run.times, run.observed, self.across, path_at)
 
     def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
         """Simulated less observed (K, M, 3) [m, world] of each run; of a held-out run nothing but on request."""
@@ -352,15 +334,21 @@ class BodySimulation:
         return None
 
     def early(self, base: Fitted) -> Sequence[BodySimulation]:
-        """The first moments, then ever more, where the residual is as large as the swing: then the phase is lost.
-
-        Those that are left out are in it, unsteady as they are: the phase counts from there, and an effective start
-        would make up for any frequency."""
-        swing = [run.observed - run.observed.mean(0) for run in self.experiments if run.fitted]
-        if base.fit_mm < LOST * rms_mm(swing):
+        """The first moments, then ever more, where the phase is lost. None where they are left out: an effective start
+        makes up for nearly any motion that is short."""
+        runs = [run for run in self.experiments if run.fitted]
+        if not self._out_of_phase(base) or any(run.skip for run in runs):
             return ()
-        runs = [run for run in self.whole or self.experiments if run.fitted]
         return [self.over([shortened(run, horizon) for run in runs]) for horizon in self.horizons]
+
+    def lost(self, base: Fitted) -> bool:
+        """Whether the phase is lost, and there are no first moments to count it from."""
+        return self._out_of_phase(base) and any(run.skip for run in self.experiments)
+
+    def _out_of_phase(self, base: Fitted) -> bool:
+        """Whether the residual is as large as the swing."""
+        swing = [run.observed - run.observed.mean(0) for run in self.experiments if run.fitted]
+        return base.fit_mm >= LOST * rms_mm(swing)
 
     def objections(self, before: Fitted, after: Fitted, term: Term, config: RefineConfig) -> list[str]:
         """What the medium cannot do."""
