@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from masiv.effects.catalogue import effect_named
 from masiv.refine.config import RefineConfig
 from masiv.refine.refit import Fitted
 from masiv.refine.simulated import Term, Watched
@@ -79,7 +80,8 @@ def objections(
     sigmas = sigmas_from_zero(after, term)
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
-    for p in term.parameters:
+    # What acts on the matter at a place may well be at the body's face, where its place ends.
+    for p in term.strengths if effect_named(term.effect).inside else term.parameters:
         if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper):
             out.append(f"{p.name} runs into the bound of what is possible, {p.upper:g}")
     return out
