@@ -204,25 +204,26 @@ def _rank(trials: list[Trial]) -> None:
 
 
 def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, say: Say) -> None:
-    """Fit the best trial further, and what is simpler, with the same law, again from where the best one ended: chord
-    steps need not have arrived, and a flexible cause that found the right law and launch must not win for that."""
+    """Fit what is simpler than the best trial, with the same law, again from where the best one ended: a flexible cause
+    that found the right law and launch must not win for that alone."""
     best = trials[0].fitted
-    again = [t for t in trials if t.fitted.model.family.kind == best.model.family.kind]
-    again = [t for t in again if t.fitted is best or len(t.fitted.parameters) < len(best.parameters)]
-    for done, trial in enumerate(again):
-        say("refine: fit effects again", done, len(again), trial.candidate.effect)
-        mine = trial.fitted
-        shared = {p.name for p in mine.parameters} & {p.name for p in best.parameters}
-        values = {**mine.values, **{name: best.values[name] for name in shared}}
+    simpler = [
+        t for t in trials[1:]
+        if t.fitted.model.family.kind == best.model.family.kind and len(t.fitted.parameters) < len(best.parameters)
+    ]  # fmt: skip
+    for done, trial in enumerate(simpler):
+        say("refine: fit simpler effects again", done, len(simpler), trial.candidate.effect)
+        shared = {p.name for p in trial.fitted.parameters} & {p.name for p in best.parameters}
+        values = {**trial.fitted.values, **{name: best.values[name] for name in shared}}
         strengths = simulation.term(trial.candidate.effect).strengths
-        budget = 2 * (len(mine.parameters) + 2)
+        budget = 2 * (len(trial.fitted.parameters) + 2)
         try:
-            if mine is not best:
-                values = strengths_alone(simulation, mine.model, values, strengths, soft)
-            found = full_fit(simulation, mine.model, values, budget=budget, soft=soft, held=held_in(simulation, mine))
+            values = strengths_alone(simulation, trial.fitted.model, values, strengths, soft)
+            held = held_in(simulation, trial.fitted)
+            again = full_fit(simulation, trial.fitted.model, values, budget=budget, soft=soft, held=held)
         except MasivError:
             continue
-        trial.fitted = min(found, mine, key=lambda f: f.cost)
+        trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
 
 
 def carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
