@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from masiv.checkpoint import Checkpoint
+from masiv.continuum.carve import visual_hull
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.fill import FilledVolume, fill_volume
 from masiv.continuum.finetune import Known, fine_tune
@@ -47,10 +48,11 @@ def extend_trajectory(
             f"{known}: give the scene and the motion of the same frames, more than the trajectory has"
         )
     start = FilledVolume(trajectory.positions[0].astype(np.float64), trajectory.spacing, trajectory.volume)
+    hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
     volumes = []
     for frame in range(known, scene.frame_count):
         progress("fill new frames", frame - known + 1, scene.frame_count - known)
-        volumes.append(fill_volume(scene, dynamic_all, frame, config, spacing=0.9 * start.spacing))
+        volumes.append(fill_volume(scene, dynamic_all, frame, config, spacing=0.9 * start.spacing, volume=hull))
     first = Known(
         torch.from_numpy(trajectory.positions - trajectory.positions[0]),
         _joined(motion, dynamic_all.canonical.means.detach(), trajectory, seed),

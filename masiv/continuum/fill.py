@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from masiv.continuum.carve import visual_hull
 from masiv.continuum.config import TrajectoryConfig
+from masiv.continuum.settle import settled_hull
 from masiv.continuum.silhouette import sample_bilinear, silhouettes
 from masiv.errors import MasivError
 from masiv.scene.camera import Camera
@@ -65,12 +66,14 @@ def fill_volume(
     config: TrajectoryConfig,
     *,
     spacing: float | None = None,
+    volume: float | None = None,
 ) -> FilledVolume:
     """Fill the object of ``frame`` with about ``config.particle_count`` particles, or with the given ``spacing`` [m].
 
+    volume [m³]: of the object's hull at frame 0, where it is known: see ``settled_hull``.
     Without ``dynamic`` only the silhouettes carve. Raises MasivError where nothing is left of the object.
     """
-    field = density_field(scene, dynamic, frame, config)
+    field = density_field(scene, dynamic, frame, config, volume=volume)
     if spacing is None:
         spacing = (field.volume / config.particle_count) ** (1 / 3)
     points = even_points(field, spacing)
@@ -82,9 +85,21 @@ def fill_volume(
     return FilledVolume(points, spacing, len(points) * spacing**3)
 
 
-def density_field(scene: Scene, dynamic: DynamicGaussians | None, frame: int, config: TrajectoryConfig) -> DensityField:
-    """Carve ``frame`` by its silhouettes and, with ``dynamic``, by the depth of the rendered surface; clean it."""
+def density_field(
+    scene: Scene,
+    dynamic: DynamicGaussians | None,
+    frame: int,
+    config: TrajectoryConfig,
+    *,
+    volume: float | None = None,
+) -> DensityField:
+    """Carve ``frame`` by its silhouettes and, with ``dynamic``, by the depth of the rendered surface; clean it.
+
+    With ``volume`` [m³], that of the hull at frame 0, the hull is settled first.
+    """
     hull = visual_hull(scene, frame, resolution=config.fill_resolution)
+    if volume is not None:
+        hull = settled_hull(scene, frame, hull, volume)
     spacing = hull.spacing
     margin = 2
     lower = hull.points.min(axis=0) - margin * spacing

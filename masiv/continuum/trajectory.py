@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from masiv.checkpoint import Checkpoint
+from masiv.continuum.carve import visual_hull
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.consistency import consistent_particles
 from masiv.continuum.fill import FilledVolume, density_field, even_points, fill_volume
@@ -102,10 +103,11 @@ def estimate_trajectory(
     """
     checkpoint = checkpoint or Checkpoint(None)
     start = fill_start(scene, dynamic, config)
+    hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
     volumes = []
     for frame in range(1, scene.frame_count):
         progress("fill", frame, scene.frame_count - 1)
-        volumes.append(fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing))
+        volumes.append(fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=hull))
     network = fine_tune(scene, dynamic, start, volumes, config, seed=seed, checkpoint=checkpoint, progress=progress)
     positions = carry(network, start.points, scene.times)
     if not np.isfinite(positions).all():

@@ -13,6 +13,7 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.carve import visual_hull
+from masiv.continuum.settle import settled_hull
 from masiv.errors import InputError, MasivError
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
@@ -80,15 +81,16 @@ class _Following:
         self.iterations = math.ceil(follow_config.effort * config.iterations / self.known * len(new))
         self.observations = dict(zip(new, observations(scene, config, new), strict=True))
         progress("follow", 0, self.iterations, "carving hulls")
-        hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in range(self.known - 1, self.count)]
+        frames = range(self.known - 1, self.count)
+        first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
+        hulls = [settled_hull(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
 
         means = dynamic.canonical.means.detach()
         self.gaussians = _parameters(dynamic.canonical)
         first, second = neighbour_pairs(means.double().numpy(), config.neighbours)
         self.pairs = torch.from_numpy(first), torch.from_numpy(second)
         self.half_extent = known.settings["half_extent"]
-        volume = visual_hull(scene, 0, resolution=config.hull_resolution).volume
-        pulls = {frame: HullPull(hull, volume) for frame, hull in zip(new, hulls[1:], strict=True)}
+        pulls = {frame: HullPull(hull) for frame, hull in zip(new, hulls[1:], strict=True)}
         scale = float(dynamic.canonical.scales.mean())
         self.objective = Objective(config, scale, self.half_extent, scene.fps, scene.ground, pulls)
 

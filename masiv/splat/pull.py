@@ -17,20 +17,10 @@ _CATCH_UP_STEPS = 60
 _CATCH_UP_POINTS = 400
 
 
-VOLUME_SLACK = 1.1
-"""A hull may exceed that of frame 0 by this factor; more is a part that no camera sees to be empty, such as the cone
-above a puddle that all cameras look down on."""
-
-
 class HullPull:
-    """How far Gaussians are from the hull of one frame: both ways, so that no part of the hull stays empty.
+    """How far Gaussians are from the hull of one frame: both ways, so that no part of the hull stays empty."""
 
-    volume [m^3]: of the hull at frame 0. Matter does not grow: where ``hull`` is larger by more than ``VOLUME_SLACK``,
-    as large a share of its surface does not pull, the farthest points first.
-    """
-
-    def __init__(self, hull: VisualHull, volume: float) -> None:
-        self.filled = min(1.0, VOLUME_SLACK * volume / hull.volume)
+    def __init__(self, hull: VisualHull) -> None:
         self.spacing = hull.spacing
         self.volume = cKDTree(hull.points)
         self.shell = torch.tensor(hull.points[hull.surface], dtype=torch.float32)
@@ -47,16 +37,11 @@ class HullPull:
         nearest = self.volume.query(positions[inside.numpy()])[1]
         hull = torch.tensor(self.volume.data[nearest], dtype=torch.float32)
         owner = torch.from_numpy(cKDTree(positions).query(shell.numpy())[1])
-        return self._beyond(here - hull).mean() + self._nearest(self._beyond(means[owner] - shell)).mean()
+        return self._beyond(here - hull).mean() + self._beyond(means[owner] - shell).mean()
 
     def _beyond(self, offset: torch.Tensor) -> torch.Tensor:
         length = (offset.square().sum(-1) + 1e-12).sqrt()
         return torch.relu(length - 2 * self.spacing)
-
-    def _nearest(self, beyond: torch.Tensor) -> torch.Tensor:
-        """``beyond`` (M,) of the points that may pull."""
-        count = max(1, int(self.filled * len(beyond)))
-        return beyond if count == len(beyond) else beyond.sort().values[:count]
 
 
 def continue_motion(

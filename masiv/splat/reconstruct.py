@@ -57,7 +57,7 @@ class _Fit:
         progress("reconstruct", 0, config.iterations, "carving hulls")
         start = starting_point(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
         self.half_extent = start.half_extent
-        hulls = tuple(HullPull(hull, start.hulls[0].volume) for hull in start.hulls)
+        hulls = tuple(HullPull(hull) for hull in start.hulls)
         self.objective = Objective(config, start.scale, start.half_extent, scene.fps, scene.ground, hulls)
         if state is not None and state["identity"] == self.identity:
             self._resume(state)

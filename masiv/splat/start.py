@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from masiv.continuum.carve import VisualHull, visual_hull
+from masiv.continuum.settle import settled_hull
 from masiv.errors import MasivError
 from masiv.scene.scene import Scene
 
@@ -14,7 +15,7 @@ from masiv.scene.scene import Scene
 @dataclass(frozen=True)
 class Start:
     """means (N, 3) [m]; scale [m]; colours (N, 3) in [0, 1]; centre (3,) and half_extent [m] of the first hull;
-    base_motion (T, 3) [m], centroids of the hulls relative to frame 0; hulls of the T frames."""
+    base_motion (T, 3) [m], centroids of the hulls relative to frame 0; hulls of the T frames, settled."""
 
     means: np.ndarray
     scale: float
@@ -27,8 +28,9 @@ class Start:
 
 def starting_point(scene: Scene, count: int, resolution: int, rng: np.random.Generator) -> Start:
     """Start from the visual hulls of ``scene``. Raises MasivError where a hull is empty, as ``visual_hull`` does."""
-    hulls = tuple(visual_hull(scene, frame, resolution=resolution) for frame in range(scene.frame_count))
-    hull = hulls[0]
+    hull = visual_hull(scene, 0, resolution=resolution)
+    later = (visual_hull(scene, frame, resolution=resolution) for frame in range(1, scene.frame_count))
+    hulls = (hull, *(settled_hull(scene, frame, h, hull.volume) for frame, h in enumerate(later, start=1)))
     centroids = np.stack([h.points.mean(axis=0) for h in hulls])
     shell = hull.points[hull.surface]
     if len(shell) < 2:
