@@ -16,6 +16,7 @@ from masiv.refine.loop import in_reach
 from masiv.refine.model import Simulation
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import best_strength, leapt, strengths_alone
+from masiv.refine.score import score
 from masiv.refine.simulated import Term
 
 INSTANTS, ROWS, POINTS = 6, 4, 5
@@ -193,3 +194,27 @@ def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
     assert simulation.early(SimpleNamespace(squares=[near])) == []
     away = np.where(np.arange(30) < 12, near, 0.2**2)  # at the end of frame 6, all is well
     assert [s.experiments[0].fitted for s in simulation.early(SimpleNamespace(squares=[away]))] == [9, 10]
+
+
+def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():
+    shape = np.random.default_rng(0).normal(size=40)
+
+    class Kinked:
+        """Nothing below a slipperiness of 1, more and more above it; 5 is true."""
+
+        def lost(self, base):
+            return False
+
+        def term(self, name):
+            return Term(name, name, (Parameter("a", 0.0, 0.0, 100.0, 0.5),), (), ((),), {"a": "1"})
+
+        def residual(self, model, values):
+            return shape * (max(values["a"] - 1.0, 0.0) - 4.0)
+
+    base = SimpleNamespace(
+        residual=-4.0 * shape, jacobian=np.ones((40, 1)), parameters=parameters()[:1], values={"a": 0.0}, samples=40,
+        model=SimpleNamespace(effects=(), with_effect=lambda name: None),
+    )  # fmt: skip
+    (found,) = score(Kinked(), base, soft=1e6, names=["ground_friction"])
+    assert found.explained == pytest.approx(1.0, abs=1e-6)
+    assert 3.0 < found.theta["a"] < 9.0

@@ -64,6 +64,8 @@ class Effect(ABC):
     strengths: ClassVar[int] = 1
     on_grid: ClassVar[str | None] = None
     """``nodes``: ``node_velocity`` acts everywhere, before contact; ``ground``: it is the contact with the ground."""
+    kinked: ClassVar[bool] = False
+    """Whether it sets in at some strength, or all at once, so that a derivative at none may say nothing of it."""
     on_stress: ClassVar[bool] = False
     cause: ClassVar[bool] = True
     """False for a stop-gap, which no search may name."""

@@ -7,11 +7,13 @@ S is the explained share, the least-squares coefficient the strength (Rao's scor
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from masiv.effects.catalogue import effect_named
 from masiv.errors import NonFiniteError
 from masiv.identify.parametric import robust_weight
 from masiv.refine.refit import Fitted, free_parameters, robust_cost
@@ -19,6 +21,8 @@ from masiv.refine.simulated import Simulated, Term
 
 AS_MUCH = 0.02
 """Difference of explained shares that is none."""
+SECANTS = (1.0, 4.0, 16.0)
+"""Strengths, in steps, to which the change is taken for one with a kink."""
 FINITE = (4.0, 16.0, 64.0)
 """Strengths, in steps, that are tried where derivatives at none point nowhere."""
 NEARLY = 0.1
@@ -67,12 +71,15 @@ def score(
         if progress is not None:
             progress(name, done, len(todo))
         term = simulation.term(name)
+        sizes = SECANTS if effect_named(term.effect).kinked else SECANTS[:1]
         tried = []
         for guess in term.guesses:
-            linear = None
-            if not lost or len(term.strengths) > 1:
-                linear = _tried(simulation, base, term, guess, weight, nuisance, left)
-            tried.append(_finite(simulation, base, term, guess, linear, soft) if lost else linear)
+            linear = functools.partial(_tried, simulation, base, term, guess, weight, nuisance, left)
+            if lost:
+                way = linear(1.0) if len(term.strengths) > 1 else None
+                tried.append(_finite(simulation, base, term, guess, way, soft))
+            else:
+                tried += [linear(size) for size in sizes]
         known = [t for t in tried if t is not None]
         if known:
             found.append(_least(known, term))
@@ -95,9 +102,10 @@ def _least(tried: list[Candidate], term: Term) -> Candidate:
 
 def _tried(
     simulation: Simulated, base: Fitted, term: Term, guess: tuple[float, ...], weight: np.ndarray,
-    nuisance: np.ndarray, left: np.ndarray,
+    nuisance: np.ndarray, left: np.ndarray, size: float,
 ) -> Candidate | None:  # fmt: skip
-    """The effect with its places, frequencies… at ``guess``; None where its rollouts diverge."""
+    """The effect with its places, frequencies… at ``guess``, linear from none to ``size`` steps of its strengths; None
+    where its rollouts diverge."""
     model = base.model.with_effect(term.name)
     strengths, others = term.strengths, term.others
     fixed = {p.name: value for p, value in zip(others, guess, strict=True)}
@@ -105,7 +113,8 @@ def _tried(
     columns = []
     try:
         for p in strengths:
-            columns.append((simulation.residual(model, {**absent, p.name: p.step}) - base.residual) / p.step)
+            far = min(size * p.step, p.upper)
+            columns.append((simulation.residual(model, {**absent, p.name: far}) - base.residual) / far)
     except NonFiniteError:
         return None
     s = np.stack(columns, axis=1)
