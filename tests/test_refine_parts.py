@@ -133,6 +133,9 @@ def test_evidence():
     assert judged(fits(9, 20), fits(2, 20)) == []  # they cannot tell, the fitted ones are plain
     assert "held-out" in judged(fits(9, 20), fits(6, 20))[0]  # not plain enough for that
     assert judged(fits(2, 20), fits(1.5, 3)) == []  # they are decisive
+    # The less the fitted instants say, the more the held-out ones must: half of what noise could change, a third of 20.
+    assert judged(fits(1.6, 20), fits(1.1, 8)) == []
+    assert "asked: 32 %" in judged(fits(1.6, 20), fits(1.1, 10))[-1]
     # What has a strength and nothing else may explain less, but not against what is held out.
     little = fits(1.6, 2.0), fits(1.2, 1.2)
     assert "of what noise" in judged(*little)[0]

@@ -30,10 +30,12 @@ class RefineConfig(BaseModel):
         "looked for, and where none is found, it is called unexplained",
     )  # fmt: skip
     least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")
-    least_gain: float = Field(0.15, ge=0, le=1, description="share of the held-out error that an effect must remove")
-    decisive_gain: float = Field(
-        0.5, ge=0, le=1, description="share of the held-out error whose removal is enough evidence alone"
-    )
+    least_gain: float = Field(
+        0.15, ge=0, le=1,
+        description="share of the held-out error that an effect must remove where it explains more of the fitted "
+        "motion than noise and grid could change",
+    )  # fmt: skip
+    decisive_gain: float = Field(0.5, ge=0, le=1, description="the same where it explains next to nothing of that")
     decisive: float = Field(
         4.0, ge=1,
         description="variance that an effect must explain, over the noise's, in the phase where the simulation is as "
