@@ -209,7 +209,7 @@ def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():
             return False
 
         def term(self, name):
-            return Term(name, name, (Parameter("a", 0.0, 0.0, 100.0, 0.5),), (), ((),), {"a": "1"})
+            return Term(name, name, (Parameter("a", 0.0, 0.0, 100.0, 0.5),), (), ((),), {}, kinked=True)
 
         def residual(self, model, values):
             return shape * (max(values["a"] - 1.0, 0.0) - 4.0)
@@ -218,6 +218,6 @@ def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():
         residual=-4.0 * shape, jacobian=np.ones((40, 1)), parameters=parameters()[:1], values={"a": 0.0}, samples=40,
         model=SimpleNamespace(effects=(), with_effect=lambda name: None),
     )  # fmt: skip
-    (found,) = score(Kinked(), base, soft=1e6, names=["ground_friction"])
+    (found,) = score(Kinked(), base, soft=1e6, names=["slide"])
     assert found.explained == pytest.approx(1.0, abs=1e-6)
     assert 3.0 < found.theta["a"] < 9.0

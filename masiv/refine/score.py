@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from masiv.effects.catalogue import effect_named
 from masiv.errors import NonFiniteError
 from masiv.identify.parametric import robust_weight
 from masiv.refine.refit import Fitted, free_parameters, robust_cost
@@ -71,7 +70,7 @@ def score(
         if progress is not None:
             progress(name, done, len(todo))
         term = simulation.term(name)
-        sizes = SECANTS if effect_named(term.effect).kinked else SECANTS[:1]
+        sizes = SECANTS if term.kinked else SECANTS[:1]
         tried = []
         for guess in term.guesses:
             linear = functools.partial(_tried, simulation, base, term, guess, weight, nuisance, left)

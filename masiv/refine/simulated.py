@@ -25,7 +25,7 @@ class Term:
     """An effect as it may be added to a model. name: that of the effect, followed by whom it acts on where that is not
     everything; strengths: parameters that are zero where it is absent; others: its places, frequencies…; guesses:
     values of the others to try in the score test; units by parameter; bodies: whom it acts on (none: everything);
-    stands_for: parameters of a model without it that it makes superfluous."""
+    stands_for: parameters of a model without it that it makes superfluous; kinked: see ``Effect``."""
 
     name: str
     effect: str
@@ -35,6 +35,7 @@ class Term:
     units: dict[str, str]
     bodies: tuple[str, ...] = ()
     stands_for: tuple[str, ...] = ()
+    kinked: bool = False
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -55,7 +56,8 @@ def plain_term(name: str, setting: Setting) -> Term:
     own = effect_parameters(name)
     units = {f"{name}.{p.name}": p.unit for p in effect.parameters}
     cut = effect.strengths
-    return Term(name, name, own[:cut], own[cut:], tuple(tuple(g) for g in effect.guesses(setting)), units)
+    guesses = tuple(tuple(g) for g in effect.guesses(setting))
+    return Term(name, name, own[:cut], own[cut:], guesses, units, kinked=effect.kinked)
 
 
 class Watched(Protocol):
