@@ -17,6 +17,8 @@ def oracle(simulation, outcome, *, law: str, contact: str, parameters: Mapping[s
     from masiv.refine.model import Model, effect_parameters
     from masiv.refine.refit import full_fit
 
+    # Its own substeps: those that the search settled on may be too long for the true stiffness.
+    simulation = type(simulation)(simulation.experiments)
     model = Model(FAMILIES[law], contact, tuple(effects))
     told = {p.name: effects[n][p.name.split(".")[1]] for n in effects for p in effect_parameters(n)}
     fits, problem = [], ""

@@ -56,6 +56,8 @@ def load_config(
     if name is not None or base is None:
         kept = {key: merged[key] for key in ("seed", "arch") if key in merged}
         merged = {**kept, **preset_overlay(str(name or DEFAULT_PRESET))}
+    else:  # a key of an earlier version is the run's, not of what is given now
+        validated(Config, merged, "run.yaml of the run, section config")
     merged = _merged(merged, from_file)
     if preset is not None:
         merged["preset"] = preset

@@ -45,6 +45,9 @@ def test_file_over_preset_and_flag_over_file(tmp_path):
 def test_a_run_is_the_base_unless_a_preset_is_asked_for(tmp_path):
     base = load_config(None, write(tmp_path, "seed: 9\ntrajectory: {iterations: 11}")).model_dump(mode="json")
     assert load_config(base=base).model_dump(mode="json") == base
+    stale = {**base, "refine": {**base["refine"], "another": 1.0}}
+    with pytest.raises(InputError, match=r"run.yaml of the run.*unknown key 'refine.another'"):
+        load_config(base=stale)
     again = load_config("quick", base=base)
     assert again.seed == 9
     assert again.trajectory == load_config("quick").trajectory
