@@ -82,7 +82,7 @@ def found(*motions, **settings):
 
 
 def test_undeclared_drag_is_named_measured_and_confirmed():
-    refined, document = found(observed({"linear_drag": [1.0]}))
+    refined, document = found(observed({"linear_drag": [1.0]}), max_effects=1)
     assert document["verdict"] == "effect added"
     assert [a["effect"] for a in document["accepted"]] == ["linear_drag"]
     assert document["accepted"][0]["theta"]["rate"] == pytest.approx(1.0, rel=0.1)
@@ -110,6 +110,20 @@ def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
     assert len(refined.after) == 2
     with pytest.raises(InputError, match="unknown effect 'ether'"):
         found(other, effects=["ether"])
+
+
+def test_a_second_cause_is_seen_beside_one_that_took_it_over():
+    pair = {"body_force": [1.5, 0.0, -1.0], "linear_drag": [0.7]}
+    _, document = found(
+        observed(pair, noise_m=3e-3), effects=["body_force", "linear_drag"], shortlist=2, baseline_rollouts=24
+    )
+    values = {a["effect"]: list(a["theta"].values()) for a in document["accepted"]}
+    assert values.keys() == pair.keys()
+    for name, true in pair.items():
+        assert values[name] == pytest.approx(true, abs=0.05)
+    assert [[r["effect"] for r in done["refits"] if r["accepted"]] for done in document["rounds"]] == [
+        ["body_force"], ["linear_drag"]
+    ]  # fmt: skip
 
 
 def test_nothing_is_missing_where_nothing_is():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from masiv.identify.parametric import Parameter
+from masiv.refine import second_look
 from masiv.refine.add_effect import absent
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
@@ -143,6 +144,32 @@ def test_evidence():
     assert "held-out" in judged(fits(1.6, 2.0), fits(1.2, 2.0), adapts=False)[-1]
     # Nothing is plain where the simulation is nowhere as certain as the observation.
     assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]
+
+
+def test_a_second_cause_is_confirmed_or_clear_and_both_are_certain():
+    rate = Parameter("linear_drag.rate", 0.1, 0.0, 10.0, 0.1)
+    term = Term("linear_drag", "linear_drag", (rate,), (), ((),), {})
+    simulation = SimpleNamespace(
+        term=lambda name: term, objections=lambda *_: [], experiments=[Watched(sigma=np.full(INSTANTS, NOISE))]
+    )
+
+    def pair(gain, held_out, sigmas=5.0):
+        found = fits(1.0, held_out)
+        found.model, found.samples, found.jacobian = SimpleNamespace(effects=("linear_drag",)), 100, np.ones((4, 1))
+        found.parameters, found.values, found.stderr = [rate], {rate.name: 1.0}, {rate.name: 1.0 / sigmas}
+        found.bic = lambda samples: -gain
+        return found
+
+    def objected(gain, was, now, **more):
+        config = RefineConfig.model_validate({})
+        return " ".join(second_look.objections(simulation, pair(0.0, was), pair(gain, now, **more), config))
+
+    assert objected(15, 4.0, 2.0) == ""  # held-out frames confirm it
+    assert "do not confirm" in objected(15, 2.0, 2.0)
+    assert objected(25, 2.0, 3.0) == ""  # they cannot tell, and the criterion is clear
+    assert "does not mend" in objected(25, 9.0, 9.0)
+    assert "less than 10" in objected(5, 4.0, 2.0)
+    assert "2.0 standard errors" in objected(25, 4.0, 2.0, sigmas=2.0)
 
 
 def test_a_strength_counts_with_its_place_held():

@@ -80,11 +80,18 @@ def objections(
     sigmas = sigmas_from_zero(after, term)
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
+    return out + beyond_possible(after, term)
+
+
+def beyond_possible(after: Fitted, term: Term) -> list[str]:
+    """Which parameters of ``term`` ran into the bound of what is possible, as objections."""
     # What acts on the matter at a place may well be at the body's face, where its place ends.
-    for p in term.strengths if effect_named(term.effect).inside else term.parameters:
-        if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper):
-            out.append(f"{p.name} runs into the bound of what is possible, {p.upper:g}")
-    return out
+    bounded = term.strengths if effect_named(term.effect).inside else term.parameters
+    return [
+        f"{p.name} runs into the bound of what is possible, {p.upper:g}"
+        for p in bounded
+        if after.values[p.name] >= p.upper - 1e-9 * abs(p.upper)
+    ]
 
 
 def sigmas_from_zero(fitted: Fitted, term: Term) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,8 +13,10 @@ from masiv.refine.add_effect import CHORD_STEPS, refit
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import above_noise, excess, objections, simplest
 from masiv.refine.noise import uncertainties
-from masiv.refine.refit import Fitted, full_fit, held_in, ordered, reweighted, softness, strengths_alone
-from masiv.refine.score import Candidate, alike, score
+from masiv.refine.refit import Fitted, carried, full_fit, held_in, ordered, reweighted, softness, strengths_alone
+from masiv.refine.rounds import TELLS_APART, Round, Trial, confusable
+from masiv.refine.score import Candidate, score
+from masiv.refine.second_look import second_look
 from masiv.refine.simulated import Simulated
 
 Say = Callable[[str, int, int, str], None]
@@ -23,32 +25,6 @@ SOFT = 5.0
 """Sizes of the noise from which a weighted residual counts as wild, at the least."""
 MISJUDGED = 1.5
 """By how much a ranking, which is linear, may have judged a cause too small."""
-TELLS_APART = 6.0
-"""Difference of the information criterion below which two refits explain the data equally well."""
-
-
-@dataclass
-class Trial:
-    """An effect that was fitted through the rollout, and why it was or was not accepted."""
-
-    candidate: Candidate
-    fitted: Fitted
-    reasons: list[str] = field(default_factory=list)
-
-    @property
-    def passes(self) -> bool:
-        return not self.reasons
-
-
-@dataclass
-class Round:
-    """One pass: what was tried on top of which model."""
-
-    base: Fitted
-    candidates: list[Candidate]
-    trials: list[Trial]
-    accepted: Trial | None
-    confusable: dict[str, list[str]]
 
 
 @dataclass
@@ -82,13 +58,18 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
         if done.accepted is None:
             break
         current = done.accepted.fitted
-        if excess(current, simulation.experiments) < config.unexplained:
+        last = len(rounds) == config.max_effects
+        if excess(current, simulation.experiments) < config.unexplained and (last or not config.second_look):
             break
         # With the effect the body may touch what it did not, earlier than before: what a finer grid changes is another.
         if weigh(simulation, current, observation):
             current = carried(simulation, current, soft)
         rivals = [current]
         if excess(current, simulation.experiments) < config.unexplained:
+            if config.second_look and not last:
+                looks = second_look(simulation, current, done, soft, config, say)
+                rounds += looks
+                current = _told_apart(current, done, looks)
             break
     experiments = simulation.experiments
     left, there_was = excess(current, experiments), excess(before, experiments)
@@ -102,6 +83,22 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
     if config.shortlist and excess(current, experiments) > config.unexplained:
         gap = stop_gap(simulation, current, soft, config, say)
     return Outcome(before, current, rounds, gap)
+
+
+def _told_apart(current: Fitted, first: Round, looks: Sequence[Round]) -> Fitted:
+    """``current``, or two causes that explain more, where ``looks`` found these: ``first`` then names the one of them
+    that it had tried."""
+    for done in looks:
+        if done.accepted is None:
+            continue
+        found = done.accepted.fitted
+        if first.accepted is not None and done.base.model.effects != current.model.effects:
+            pair = " and ".join(found.model.effects)
+            first.accepted.reasons.append(f"{pair} together explain more")
+            (name,) = set(done.base.model.effects) - set(first.base.model.effects)
+            first.accepted = next(t for t in first.trials if t.candidate.effect == name and t.passes)
+        return found
+    return current
 
 
 def stop_gap(simulation: Simulated, current: Fitted, soft: float, config: RefineConfig, say: Say) -> Fitted | None:
@@ -172,7 +169,7 @@ def _round(
     if trials:
         _second_chance(simulation, trials, soft, say)
         _rank(trials)
-    confusable = _confusable(ranking, trials, config.confusable)
+    alike = confusable(ranking, trials, config.confusable)
     accepted = None
     for trial in trials:
         trial.reasons = _reasons(simulation, current, trial, config)
@@ -188,7 +185,7 @@ def _round(
         trial.fitted = _freed(simulation, min(final, trial.fitted, key=lambda f: f.cost), soft)
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
-    return Round(current, ranking, trials, accepted, confusable)
+    return Round(current, ranking, trials, accepted, alike)
 
 
 def in_reach(candidate: Candidate, base: Fitted, trials: Sequence[Trial]) -> bool:
@@ -226,13 +223,6 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
         trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
 
 
-def carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
-    """``fitted`` as a start in another simulation of the same experiments."""
-    budget = 8 * (len(simulation.parameters(fitted.model)) + 1)
-    held = held_in(simulation, fitted)
-    return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft, held=held)
-
-
 def _freed(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
     """With what was left at a guess fitted as well, where the information criterion asks for it."""
     if not held_in(simulation, fitted):
@@ -266,21 +256,3 @@ def _outdone(
         ):
             return [f"{other.candidate.effect} explains more with no more parameters, and is not certain"]
     return []
-
-
-def _confusable(ranking: list[Candidate], trials: list[Trial], least: float) -> dict[str, list[str]]:
-    """Effects whose pattern in this data is nearly that of another."""
-    out: dict[str, set[str]] = {c.effect: set() for c in ranking}
-    for a in ranking:
-        for b in ranking:
-            if a.effect != b.effect and min(a.explained, b.explained) > 0.02 and alike(a, b) >= least:
-                out[a.effect].add(b.effect)
-    best: dict[str, float] = {}
-    samples = min((t.fitted for t in trials), key=lambda f: f.cost).samples if trials else 0
-    for t in trials:
-        best[t.candidate.effect] = min(best.get(t.candidate.effect, math.inf), t.fitted.bic(samples))
-    for a, bic_a in best.items():
-        for b, bic_b in best.items():
-            if a != b and abs(bic_a - bic_b) < TELLS_APART and a in out and b in out:
-                out[a].add(b)
-    return {name: sorted(others) for name, others in out.items()}

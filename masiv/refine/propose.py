@@ -8,9 +8,10 @@ import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.progress import Progress
-from masiv.refine.loop import TELLS_APART, Outcome
+from masiv.refine.loop import Outcome
 from masiv.refine.model import Simulation
 from masiv.refine.refit import ordered
+from masiv.refine.rounds import TELLS_APART
 
 THROWS = (
     ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((3.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0)),

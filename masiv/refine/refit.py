@@ -310,6 +310,13 @@ def held_in(simulation: Simulated, fitted: Fitted) -> frozenset[str]:
     return frozenset(p.name for p in simulation.parameters(fitted.model) if p.name in fitted.values) - own
 
 
+def carried(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
+    """``fitted`` as a start in another simulation of the same experiments."""
+    budget = 8 * (len(simulation.parameters(fitted.model)) + 1)
+    held = held_in(simulation, fitted)
+    return full_fit(simulation, fitted.model, fitted.values, budget=budget, soft=soft, held=held)
+
+
 def started(params: Sequence[Parameter], values: Mapping[str, float]) -> tuple[Parameter, ...]:
     """Parameters that start at ``values``, where they are given, within their bounds."""
     from dataclasses import replace

@@ -10,9 +10,10 @@ import numpy as np
 from masiv.effects.catalogue import effect_named
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess
-from masiv.refine.loop import STOP_GAP, Round
+from masiv.refine.loop import STOP_GAP
 from masiv.refine.model import Experiment, effect_parameters
 from masiv.refine.refit import Fitted, rms_mm, split
+from masiv.refine.rounds import Round
 from masiv.refine.score import Candidate
 from masiv.refine.stage import Refined
 
@@ -43,7 +44,10 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
         },
         "residual_mm": {"fit": outcome.before.fit_mm, "held_out": outcome.before.held_out_mm},
         "candidates": [_candidate(c, first) for c in first.candidates] if first else [],
-        "accepted": [_accepted(name, outcome.after) for name in outcome.after.model.effects],
+        "accepted": [
+            {**_accepted(name, outcome.after), "confusable_with": _alike(name, outcome.rounds)}
+            for name in outcome.after.model.effects
+        ],
         "stop_gap": None if outcome.gap is None else _stop_gap(outcome.gap),
         "before": _errors(found, found.before),
         "after": _errors(found, found.after),
@@ -93,6 +97,14 @@ def _candidate(candidate: Candidate, first: Round) -> dict[str, Any]:
         "confusable_with": first.confusable.get(candidate.effect, []),
         "looks_like": effect.looks_like,
     }
+
+
+def _alike(name: str, rounds: list[Round]) -> list[str]:
+    """What explains the motion as well as ``name``, in the round that accepted it."""
+    found = [
+        r.confusable.get(name, []) for r in rounds if r.accepted is not None and r.accepted.candidate.effect == name
+    ]
+    return found[0] if found else []
 
 
 def _accepted(name: str, fitted: Fitted) -> dict[str, Any]:
@@ -170,8 +182,10 @@ def text(document: dict[str, Any]) -> str:
         + _held(document["residual_mm"]["held_out"])
     ]
     for c in document["candidates"][:6]:
-        alike = f"  (looks like {', '.join(c['confusable_with'])})" if c["confusable_with"] else ""
-        lines.append(f"  {c['effect']:20s} explains {100 * c['explained']:3.0f} %  {c['theta']:.3g} {c['unit']}{alike}")
+        lines.append(
+            f"  {c['effect']:20s} explains {100 * c['explained']:3.0f} %  {c['theta']:.3g} {c['unit']}"
+            + _looks_like(c["confusable_with"])
+        )
     for refits in document["rounds"]:
         for r in refits["refits"]:
             why = "accepted" if r["accepted"] else "; ".join(r["objections"]) or "another was better"
@@ -180,7 +194,7 @@ def text(document: dict[str, Any]) -> str:
             )
     for a in document["accepted"]:
         values = ", ".join(f"{n} {v:.4g}{_spread(a['stderr'][n])} {a['unit'][n]}" for n, v in a["theta"].items())
-        lines.append(f"{a['effect']}: {values}")
+        lines.append(f"{a['effect']}: {values}" + _looks_like(a["confusable_with"]))
     lines.append(
         f"before {before['fit']['trajectory_rmse_mm']:.1f} mm{_held(before['held_out'].get('trajectory_rmse_mm'))}, "
         f"after {after['fit']['trajectory_rmse_mm']:.1f} mm{_held(after['held_out'].get('trajectory_rmse_mm'))}"
@@ -196,6 +210,10 @@ def text(document: dict[str, Any]) -> str:
             f"{_vector(n['omega'])} rad/s would set them {n['predicted_difference_mm']:.0f} mm apart"
         )
     return "\n".join([*lines, document["verdict"]])
+
+
+def _looks_like(others: list[str]) -> str:
+    return f"  (looks like {', '.join(others)})" if others else ""
 
 
 def _held(value: float | None) -> str:

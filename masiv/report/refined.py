@@ -178,9 +178,16 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
         return
     page.subheading("What was added")
     page.table(
-        ["effect", "parameter", "value", "standard error", "unit"],
+        ["effect", "parameter", "value", "standard error", "unit", "looks like"],
         [
-            [_words(a["effect"]), _words(n), _number(value), _number(a["stderr"].get(n)), _unit(a["unit"].get(n, ""))]
+            [
+                _words(a["effect"]),
+                _words(n),
+                _number(value),
+                _number(a["stderr"].get(n)),
+                _unit(a["unit"].get(n, "")),
+                ", ".join(map(_words, a.get("confusable_with", []))),
+            ]
             for a in accepted
             for n, value in a["theta"].items()
         ],

@@ -12,8 +12,9 @@ import numpy as np
 from masiv.effects.catalogue import effect_named
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess
-from masiv.refine.loop import STOP_GAP, Round
+from masiv.refine.loop import STOP_GAP
 from masiv.refine.refit import Fitted, rms_mm, split
+from masiv.refine.rounds import Round
 from masiv.refine.score import Candidate
 from masiv.refine.simulated import Term
 from masiv.refine.summary import ADDED, NOTHING, UNEXPLAINED

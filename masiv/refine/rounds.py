@@ -1,0 +1,56 @@
+"""What the loop tried, round by round."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from masiv.refine.refit import Fitted
+from masiv.refine.score import Candidate, alike
+
+TELLS_APART = 6.0
+"""Difference of the information criterion below which two refits explain the data equally well."""
+
+
+@dataclass
+class Trial:
+    """An effect that was fitted through the rollout, and why it was or was not accepted."""
+
+    candidate: Candidate
+    fitted: Fitted
+    reasons: list[str] = field(default_factory=list)
+
+    @property
+    def passes(self) -> bool:
+        return not self.reasons
+
+
+@dataclass
+class Round:
+    """One pass: what was tried on top of which model."""
+
+    base: Fitted
+    candidates: list[Candidate]
+    trials: list[Trial]
+    accepted: Trial | None
+    confusable: dict[str, list[str]]
+
+
+def confusable(ranking: Sequence[Candidate], trials: Sequence[Trial], least: float) -> dict[str, list[str]]:
+    """Of each effect, those whose pattern in this data is nearly the same (correlation ``least``), or whose refit is as
+    good."""
+    out: dict[str, set[str]] = {c.effect: set() for c in ranking}
+    for a in ranking:
+        for b in ranking:
+            if a.effect != b.effect and min(a.explained, b.explained) > 0.02 and alike(a, b) >= least:
+                out[a.effect].add(b.effect)
+    best: dict[str, float] = {}
+    samples = min((t.fitted for t in trials), key=lambda f: f.cost).samples if trials else 0
+    for t in trials:
+        best[t.candidate.effect] = min(best.get(t.candidate.effect, math.inf), t.fitted.bic(samples))
+    for a, bic_a in best.items():
+        for b, bic_b in best.items():
+            if a != b and abs(bic_a - bic_b) < TELLS_APART and a in out and b in out:
+                out[a].add(b)
+    return {name: sorted(others) for name, others in out.items()}

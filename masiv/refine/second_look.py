@@ -1,0 +1,107 @@
+"""A further cause that hides in what noise and grid explain: the first one took most of it over.
+
+A uniform force takes over the drag that acts beside it, and quadratic drag a linear one with viscosity, so well that
+what is left is hardly more than the noise. A ranking on top of the first cause still sees the other, if on top of the
+right one: so it is looked for beside the accepted cause and beside the one that came closest to it. That near to the
+noise only a cause of one number is looked for, which cannot adapt to an error of any shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from masiv.errors import MasivError
+from masiv.refine.add_effect import refit
+from masiv.refine.config import RefineConfig
+from masiv.refine.evidence import beyond_possible, sigmas_from_zero
+from masiv.refine.refit import Fitted, carried
+from masiv.refine.rounds import Round, Trial, confusable
+from masiv.refine.score import score
+from masiv.refine.simulated import Simulated, Watched
+
+Say = Callable[[str, int, int, str], None]
+GLIMPSE = 0.05
+"""Share of what is left below which a cause is not tried."""
+BASES = 2
+SHORTLIST = 2
+
+
+def second_look(
+    simulation: Simulated, current: Fitted, first: Round, soft: float, config: RefineConfig, say: Say
+) -> list[Round]:
+    """Rounds on top of ``current``, the model with what ``first`` accepted, and of its closest rival: the best of all
+    trials is accepted in one of them, or nothing is."""
+    bases = [current]
+    for trial in first.trials:
+        mine = trial.fitted.model
+        if trial.passes and mine.family is current.model.family and mine.effects != current.model.effects:
+            bases.append(carried(simulation, trial.fitted, soft))
+    rounds = [_round(simulation, base, current, soft, config, say) for base in bases[:BASES]]
+    trials = [t for r in rounds for t in r.trials]
+    if trials:
+        samples = min((t.fitted for t in trials), key=lambda f: f.cost).samples
+        best = min(trials, key=lambda t: t.fitted.bic(samples))
+        for done in rounds:
+            done.accepted = best if best.passes and best in done.trials else None
+    return rounds
+
+
+def _round(simulation: Simulated, base: Fitted, best: Fitted, soft: float, config: RefineConfig, say: Say) -> Round:
+    beside = ", ".join(base.model.effects)
+    names = [n for n in simulation.candidates(base.model) if len(simulation.term(n).parameters) == 1]
+    names = [n for n in names if n in config.effects or not config.effects]
+    label = f"refine: rank what may act beside {beside}"
+    candidates = score(
+        simulation, base, soft=soft, names=names, progress=lambda n, i, k: say(label, i, k, n)
+    ) if names else []  # fmt: skip
+    say(label, 1, 1, candidates[0].effect if candidates else "none")
+    trials = []
+    for candidate in [c for c in candidates if c.explained >= GLIMPSE][:SHORTLIST]:
+        label = f"refine: fit {candidate.effect} beside {beside}"
+        say(label, 0, 1, "")
+        try:
+            trial = Trial(candidate, carried(simulation, refit(simulation, base, candidate, soft), soft))
+        except MasivError as failed:
+            say(label, 1, 1, str(failed))
+            continue
+        trial.reasons = objections(simulation, best, trial.fitted, config)
+        trials.append(trial)
+        say(label, 1, 1, f"{trial.fitted.fit_mm:.1f} mm")
+    return Round(base, candidates, trials, None, confusable(candidates, trials, config.confusable))
+
+
+def objections(simulation: Simulated, before: Fitted, after: Fitted, config: RefineConfig) -> list[str]:
+    """Why the effects of ``after`` are not named instead of those of ``before``, which are one fewer; empty where they
+    are. Each must be there for certain, and either held-out instants confirm the two, or these cannot tell and the
+    information criterion is clear."""
+    out = []
+    gain = before.bic(after.samples) - after.bic(after.samples)
+    if gain < config.least_bic:
+        out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
+    for name in after.model.effects:
+        term = simulation.term(name)
+        sigmas = sigmas_from_zero(after, term)
+        if not sigmas >= config.least_sigmas:
+            out.append(f"{name} is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
+        out += beyond_possible(after, term)
+        out += simulation.objections(before, after, term, config)
+    was, now = (held_out(f, simulation.experiments) for f in (before, after))
+    if len(was) and 1 - np.sqrt(now.sum() / max(was.sum(), 1e-300)) < config.least_gain:
+        if now.mean() > config.unexplained**2:
+            out.append("held-out frames are off by more than noise and grid explain, and it does not mend that")
+        elif gain < 2 * config.least_bic:
+            out.append(
+                f"the information criterion falls by {gain:.1f}, less than {2 * config.least_bic:g}, and held-out "
+                "frames do not confirm it"
+            )
+    return out
+
+
+def held_out(fitted: Fitted, experiments: Sequence[Watched]) -> np.ndarray:
+    """Squares over those of noise and grid at the held-out instants of all ``experiments``."""
+    parts = [
+        (squares / e.sigma**2)[e.rows :] for squares, e in zip(fitted.squares, experiments, strict=True) if e.holds_out
+    ]
+    return np.concatenate(parts) if parts else np.zeros(0)
