@@ -146,7 +146,7 @@ def test_evidence():
     assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]
 
 
-def test_a_second_cause_is_confirmed_or_clear_and_both_are_certain():
+def test_a_second_cause_is_confirmed_and_both_are_certain():
     rate = Parameter("linear_drag.rate", 0.1, 0.0, 10.0, 0.1)
     term = Term("linear_drag", "linear_drag", (rate,), (), ((),), {})
     simulation = SimpleNamespace(
@@ -164,10 +164,11 @@ def test_a_second_cause_is_confirmed_or_clear_and_both_are_certain():
         config = RefineConfig.model_validate({})
         return " ".join(second_look.objections(simulation, pair(0.0, was), pair(gain, now, **more), config))
 
-    assert objected(15, 4.0, 2.0) == ""  # held-out frames confirm it
-    assert "do not confirm" in objected(15, 2.0, 2.0)
-    assert objected(25, 2.0, 3.0) == ""  # they cannot tell, and the criterion is clear
-    assert "does not mend" in objected(25, 9.0, 9.0)
+    assert objected(15, 4.0, 1.8) == ""  # held-out frames confirm it
+    assert "asked: 30 %" in objected(15, 4.0, 2.5)
+    assert objected(25, 4.0, 2.5) == ""  # less will do where the criterion is clear
+    assert "asked: 15 %" in objected(99, 2.0, 2.0)
+    assert "-22 % of the held-out" in objected(99, 2.0, 3.0)
     assert "less than 10" in objected(5, 4.0, 2.0)
     assert "2.0 standard errors" in objected(25, 4.0, 2.0, sigmas=2.0)
 

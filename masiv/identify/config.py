@@ -42,6 +42,10 @@ class IdentifyConfig(BaseModel):
         description="what of the observed motion a neural law is fitted to: paths of particles, bodies frame by frame, "
         "their surfaces, or silhouettes alone",
     )
+    polish: bool = Field(
+        True,
+        description="after a fit to paths, half as many iterations on surfaces, kept where the silhouettes are nearer",
+    )
     trajectory_weight: float = Field(1.0, ge=0, description="of geometry_loss")
     silhouette_weight: float = Field(0.2, ge=0)
     prior_weight: float = Field(

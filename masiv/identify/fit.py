@@ -45,15 +45,16 @@ def fit(
     seed: int,
     checkpoint: Checkpoint,
     progress: Progress,
+    prior: NeuralLaw | None = None,
 ) -> Fit:
     """Adam on a horizon that grows from ``first_frames`` to all frames over the first half of the iterations.
 
     A rollout that diverges is not repaired: the step is taken back, the step sizes are halved and the horizon ends a
     frame earlier, both until steps succeed again; after several in a row the stage stops. Returns the parameters with
-    the least error over all frames. Raises MasivError.
+    the least error over all frames. prior: what a neural law is drawn to, ``law`` where None. Raises MasivError.
     """
     config = problem.config
-    start, law = law, copy.deepcopy(law)
+    start, law = prior or law, copy.deepcopy(law)
     motion = Motion(*(t.detach().clone().requires_grad_() for t in motion.tensors()))
     if isinstance(law, NeuralLaw):
         scales = [law.log_stress_scale, law.log_flow_strain]
@@ -149,6 +150,24 @@ def _silhouette(problem: Problem, positions: torch.Tensor, frames: int, seed: in
     return silhouette_errors(problem, positions, pictures)
 
 
+def fit_state(found: Fit) -> dict:
+    """What ``fit_from`` makes the same fit of."""
+    return {
+        "law": found.law.state_dict(),
+        "motion": list(found.motion.tensors()),
+        "error_m": found.error_m,
+        "discrepancy": found.discrepancy,
+        "history": found.history,
+    }
+
+
+def fit_from(state: dict, law: NeuralLaw | AdapterLaw) -> Fit:
+    """The fit of ``state``; ``law``, of its kind and width, becomes its law."""
+    law.load_state_dict(state["law"])
+    rows = [tuple(row) for row in state["history"]]
+    return Fit(law, Motion(*state["motion"]), state["error_m"], state["discrepancy"], rows)
+
+
 def _state(iteration, caution, failures, reach, parameters, optimiser, best: Fit) -> dict:
     return {
         "iteration": iteration,
@@ -157,11 +176,7 @@ def _state(iteration, caution, failures, reach, parameters, optimiser, best: Fit
         "reach": reach,
         "parameters": [p.detach() for p in parameters],
         "optimiser": optimiser.state_dict(),
-        "best_law": best.law.state_dict(),
-        "best_motion": list(best.motion.tensors()),
-        "best_error": best.error_m,
-        "best_discrepancy": best.discrepancy,
-        "history": best.history,
+        "best": fit_state(best),
     }
 
 
@@ -170,8 +185,8 @@ def _restore(state: dict, parameters, optimiser, best: Fit) -> tuple[int, float,
         for parameter, value in zip(parameters, state["parameters"], strict=True):
             parameter.copy_(value)
     optimiser.load_state_dict(state["optimiser"])
-    best.law.load_state_dict(state["best_law"])
-    best.motion = Motion(*state["best_motion"])
-    best.error_m, best.discrepancy = state["best_error"], state["best_discrepancy"]
-    best.history = [tuple(row) for row in state["history"]]
+    kept = fit_from(state["best"], best.law)
+    best.motion, best.error_m, best.discrepancy, best.history = (
+        kept.motion, kept.error_m, kept.discrepancy, kept.history
+    )  # fmt: skip
     return state["iteration"], state["caution"], state["failures"], state["reach"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,6 +97,13 @@ class Problem:
         self.speed = float((span[1:] - span[:-1]).norm(dim=2).max()) * self.samples * scene.fps
         members = tuple((effect_named(e.name), torch.tensor([v for _, v, *_ in e.rows()])) for e in known)
         self.known = ActiveEffects(members, self.setting()) if members else None
+
+    def of_surfaces(self, iterations: int) -> Problem:
+        """The same with ``iterations`` and the loss "surface"."""
+        other = copy.copy(self)
+        other.config = self.config.model_copy(update={"geometry_loss": "surface", "iterations": iterations})
+        other.surface = torch.from_numpy(np.flatnonzero(surface_points(self.start.numpy())))
+        return other
 
     def substeps(self, law: Law) -> int:
         """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number."""

@@ -29,10 +29,15 @@ def silhouette_errors(problem: Problem, positions: torch.Tensor, pictures: list[
     return torch.stack(errors).mean()
 
 
-def one_of_each(problem: Problem, frames: int) -> list[tuple[int, int]]:
-    """A picture of each of the first ``frames`` frames, the views in turn: (frame, view)."""
+def some_of_each(problem: Problem, frames: int, count: int = 1) -> list[tuple[int, int]]:
+    """``count`` pictures (all, where there are fewer) of each of the first ``frames`` frames, the views in turn:
+    (frame, view)."""
     views = problem.scene.views
-    return [(frame, views[frame % len(views)]) for frame in range(1, frames + 1)]
+    count = min(count, len(views))
+    return [
+        (frame, views[(frame + k * len(views) // count) % len(views)])
+        for frame in range(1, frames + 1) for k in range(count)
+    ]  # fmt: skip
 
 
 def discrepancy(problem: Problem, positions: torch.Tensor) -> float:
@@ -40,7 +45,7 @@ def discrepancy(problem: Problem, positions: torch.Tensor) -> float:
     with torch.no_grad():
         if problem.config.geometry_loss == "none":
             frames = len(positions) // problem.samples
-            return float(silhouette_errors(problem, positions, one_of_each(problem, frames)))
+            return float(silhouette_errors(problem, positions, some_of_each(problem, frames)))
         return float(problem.geometry_error(positions))
 
 

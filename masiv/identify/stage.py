@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +14,10 @@ from masiv.checkpoint import Checkpoint
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.baseline import identify_classical
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.fit import fit
+from masiv.identify.fit import fit, fit_from, fit_state
 from masiv.identify.found import Found, history_rows
 from masiv.identify.launch import estimate_launch
+from masiv.identify.polish import polish, wanted
 from masiv.identify.problem import Motion, Problem
 from masiv.identify.start import Start, choose_start
 from masiv.materials.neural import NeuralLaw
@@ -137,12 +139,24 @@ def _neural(
         start = _start_from(saved["start"])
     else:
         start = choose_start(few(), motion, progress)[0]
-    keeper = _With(checkpoint, {"start": _start_state(start)})
+    fixed: dict[str, Any] = {"start": _start_state(start)}
+    keeper = _With(checkpoint, fixed)
     keeper.save({**saved})
-    fitted = fit(
-        problem, start.law, motion, start.contact, first_frames, seed=seed, checkpoint=keeper, progress=progress
-    )
-    report = {"start": start.material, "geometry_loss": problem.config.geometry_loss}
+    if "paths" in saved:
+        fitted = fit_from(saved["paths"], NeuralLaw(width=start.law.width))
+    else:
+        fitted = fit(
+            problem, start.law, motion, start.contact, first_frames, seed=seed, checkpoint=keeper, progress=progress
+        )
+    report: dict[str, Any] = {"start": start.material, "geometry_loss": problem.config.geometry_loss}
+    if wanted(problem):
+        keeper = _With(checkpoint, {**fixed, "paths": fit_state(fitted)})
+        if "paths" not in saved:
+            keeper.save({})
+        fitted, seen = polish(
+            problem, fitted, start.contact, start.law, seed=seed, checkpoint=keeper, progress=progress
+        )  # fmt: skip
+        report |= seen
     report |= (
         {"start_silhouette": start.error}
         if report["geometry_loss"] == "none"

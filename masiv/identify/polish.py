@@ -1,0 +1,56 @@
+"""Paths first, then surfaces: what pictures tell for certain has the last word.
+
+Paths of particles say which matter went where, and lead a fit from far away. In a body that flows they drift with what
+the pictures do not show, and a law that is fitted to them learns the drift. Surfaces and silhouettes do not drift.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from masiv.checkpoint import Checkpoint
+from masiv.identify.fit import Fit, fit
+from masiv.identify.problem import Problem
+from masiv.identify.silhouette import silhouette_errors, some_of_each
+from masiv.materials.neural import NeuralLaw
+from masiv.progress import Progress
+
+VIEWS = 3
+"""Pictures of each frame by which the two fits are compared."""
+
+
+def wanted(problem: Problem) -> bool:
+    """Whether surfaces have the last word: a fit to paths that has silhouettes to be judged by."""
+    config = problem.config
+    judged = bool(problem.scene.views) and config.silhouette_weight > 0 and config.silhouette_pictures > 0
+    return config.polish and config.geometry_loss == "trajectory" and judged
+
+
+def polish(
+    problem: Problem,
+    fitted: Fit,
+    contact: str,
+    prior: NeuralLaw,
+    *,
+    seed: int,
+    checkpoint: Checkpoint,
+    progress: Progress,
+) -> tuple[Fit, dict[str, float]]:
+    """``fitted``, a neural law, after half as many iterations with surfaces in place of paths, or as it is where its
+    silhouettes were nearer to the masks; and both silhouette errors."""
+    surfaces = problem.of_surfaces(problem.config.iterations // 2)
+    other = fit(
+        surfaces, fitted.law, fitted.motion, contact, surfaces.frames,
+        seed=seed, checkpoint=checkpoint, prior=prior,
+        progress=lambda _, *rest: progress("identify: fit surfaces", *rest),
+    )  # fmt: skip
+    other.history = [*fitted.history, *((i + problem.config.iterations, *rest) for i, *rest in other.history)]
+    before, after = (_silhouettes(problem, f, contact) for f in (fitted, other))
+    report = {"silhouette_error_of_paths": before, "silhouette_error_of_surfaces": after}
+    return (other if after < before else fitted), report
+
+
+@torch.no_grad()
+def _silhouettes(problem: Problem, fitted: Fit, contact: str) -> float:
+    positions = problem.run(fitted.law, fitted.motion, contact, problem.frames)
+    return float(silhouette_errors(problem, positions, some_of_each(problem, problem.frames, VIEWS)))
