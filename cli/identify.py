@@ -35,8 +35,9 @@ def identify(
         str | None,
         typer.Option(
             "--geometry-loss",
-            help="What a neural law is fitted to: trajectory (paths of particles), continuum (bodies frame by frame), "
-            "surface, or none (silhouettes alone). [default: trajectory]",
+            help="What a neural law is fitted to: trajectory (paths of particles, then surfaces; paths alone with "
+            "identify.polish: false), continuum (bodies frame by frame), surface, or none (silhouettes alone). "
+            "[default: trajectory]",
         ),
     ] = None,
     no_silhouette: Annotated[
