@@ -58,15 +58,15 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
         if done.accepted is None:
             break
         current = done.accepted.fitted
-        last = len(rounds) == config.max_effects
-        if excess(current, simulation.experiments) < config.unexplained and (last or not config.second_look):
+        look = config.second_look and len(rounds) < config.max_effects
+        if excess(current, simulation.experiments) < config.unexplained and not look:
             break
         # With the effect the body may touch what it did not, earlier than before: what a finer grid changes is another.
         if weigh(simulation, current, observation):
             current = carried(simulation, current, soft)
         rivals = [current]
         if excess(current, simulation.experiments) < config.unexplained:
-            if config.second_look and not last:
+            if look:
                 looks = second_look(simulation, current, done, soft, config, say)
                 rounds += looks
                 current = _told_apart(current, done, looks)

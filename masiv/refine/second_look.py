@@ -24,7 +24,6 @@ from masiv.refine.simulated import Simulated, Watched
 Say = Callable[[str, int, int, str], None]
 GLIMPSE = 0.05
 """Share of what is left below which a cause is not tried."""
-BASES = 2
 SHORTLIST = 2
 
 
@@ -33,12 +32,14 @@ def second_look(
 ) -> list[Round]:
     """Rounds on top of ``current``, the model with what ``first`` accepted, and of its closest rival: the best of all
     trials is accepted in one of them, or nothing is."""
-    bases = [current]
-    for trial in first.trials:
-        mine = trial.fitted.model
-        if trial.passes and mine.family is current.model.family and mine.effects != current.model.effects:
-            bases.append(carried(simulation, trial.fitted, soft))
-    rounds = [_round(simulation, base, current, soft, config, say) for base in bases[:BASES]]
+    here = current.model
+    rivals = [
+        t.fitted
+        for t in first.trials
+        if t.passes and t.fitted.model.family is here.family and t.fitted.model.effects != here.effects
+    ]
+    bases = [current, *(carried(simulation, rival, soft) for rival in rivals[:1])]
+    rounds = [_round(simulation, base, current, soft, config, say) for base in bases]
     trials = [t for r in rounds for t in r.trials]
     if trials:
         samples = min((t.fitted for t in trials), key=lambda f: f.cost).samples
