@@ -125,3 +125,18 @@ def test_a_cause_that_falls_short_of_its_promise_is_begun_elsewhere():
     fitted = refit(simulation, base, found, 1.0)
     assert fitted.values["mass.place"] == pytest.approx(1.0)
     assert fitted.cost < 0.1 * base.cost
+
+
+@pytest.mark.parametrize("out_of_phase", [False, True])
+def test_what_the_base_left_at_a_guess_stays_there_beside_a_further_cause(out_of_phase):
+    simulation = Swing(out_of_phase)
+    simulation.observed = simulation.motion({"mass.mass": LOAD, "mass.place": 1.0, "push.x": 3.0})
+    model = Model(None, "none", ("mass",))
+    held = frozenset({"mass.place"})
+    base = full_fit(simulation, model, {"mass.mass": LOAD, "mass.place": 1.0}, budget=8, soft=1.0, held=held)
+    (push,) = score(simulation, base, soft=1.0, names=["push"])
+    fitted = refit(simulation, base, push, 1.0)
+    assert fitted.values["mass.place"] == 1.0
+    assert {p.name for p in fitted.parameters} == {"mass.mass", "push.x", "push.y"}
+    assert fitted.values["push.x"] == pytest.approx(3.0, rel=0.05)
+    assert fitted.fit_mm < 0.05 * base.fit_mm

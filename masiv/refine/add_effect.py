@@ -7,12 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from masiv.errors import NonFiniteError
+from masiv.identify.parametric import Parameter
 from masiv.refine.refit import (
     Fitted,
     best_strength,
     chord_fit,
     column,
     full_fit,
+    held_in,
     leapt,
     ordered,
     robust_cost,
@@ -32,14 +34,16 @@ SHORT = 0.5
 
 def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
     """``base`` with the effect: strengths jointly with law and throw; then its places or frequencies as well, where
-    the information criterion asks for it. Else they are as guessed, and without a standard error.
+    the information criterion asks for it. Else they are as guessed, and without a standard error. What ``base`` itself
+    left at a guess stays there.
 
     Where that falls short of the promise, the effect is begun at the candidate's rivals too, and the best goes on."""
     if candidate.finite:
         return _from_strengths(simulation, base, candidate, soft)
     term = simulation.term(candidate.effect)
     model = base.model.with_effect(term.name)
-    params = simulation.parameters(model)
+    held = held_in(simulation, base)
+    params = _fitted_beside(simulation, base, term)
     names = [p.name for p in params]
     first = [p for p in params if p not in term.others]
     cost, values, residual, jacobian = _as_guessed(simulation, base, candidate, soft)
@@ -54,7 +58,7 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
         start |= {p.name: start[p.name] + candidate.theta[p.name] for p in term.strengths}
         jump, jumped = best_strength(simulation, model, start, term.strengths, soft)
         if jumped < cost:
-            return full_fit(simulation, model, jump, budget=2 * len(params) + 6, soft=soft)
+            return full_fit(simulation, model, jump, budget=2 * len(params) + 6, soft=soft, held=held)
     if not others:
         return summarised(simulation, model, params, values, jacobian, soft=soft)
     guessed = summarised(simulation, model, first, values, jacobian, soft=soft)
@@ -77,7 +81,7 @@ def _as_guessed(
     and jacobian of these."""
     term = simulation.term(candidate.effect)
     model = base.model.with_effect(term.name)
-    first = [p for p in simulation.parameters(model) if p not in term.others]
+    first = [p for p in _fitted_beside(simulation, base, term) if p not in term.others]
     jacobian = _assembled(first, base, candidate, [p.name for p in term.strengths])
     values = {**absent(term, base.values), **{p.name: candidate.theta[p.name] for p in term.others}}
     residual = simulation.residual(model, values) if term.stands_for else base.residual
@@ -93,7 +97,7 @@ def _from_strengths(simulation: Simulated, base: Fitted, candidate: Candidate, s
     held as they have them. Raises NonFiniteError where all diverge."""
     term = simulation.term(candidate.effect)
     model = base.model.with_effect(term.name)
-    held = frozenset(p.name for p in term.others)
+    held = frozenset(p.name for p in term.others) | held_in(simulation, base)
     budget = 4 * (len(simulation.parameters(model)) - len(held) + 1)
     fits, failed = [], None
     for at in (candidate, *candidate.rivals):
@@ -105,6 +109,12 @@ def _from_strengths(simulation: Simulated, base: Fitted, candidate: Candidate, s
     if failed is not None and not fits:
         raise failed
     return min(fits, key=lambda f: f.cost)
+
+
+def _fitted_beside(simulation: Simulated, base: Fitted, term: Term) -> list[Parameter]:
+    """The parameters of ``base`` with ``term``, but for those that ``base`` left at a guess: these stay there."""
+    held = held_in(simulation, base)
+    return [p for p in simulation.parameters(base.model.with_effect(term.name)) if p.name not in held]
 
 
 def _falls_short(base: Fitted, candidate: Candidate, cost: float) -> bool:
