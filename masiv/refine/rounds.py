@@ -54,3 +54,9 @@ def confusable(ranking: Sequence[Candidate], trials: Sequence[Trial], least: flo
             if a != b and abs(bic_a - bic_b) < TELLS_APART and a in out and b in out:
                 out[a].add(b)
     return {name: sorted(others) for name, others in out.items()}
+
+
+def like_accepted(name: str, rounds: Sequence[Round]) -> list[str]:
+    """What explains the motion as well as the term ``name``, in the round that accepted it."""
+    found = (r for r in rounds if r.accepted is not None and r.accepted.candidate.effect == name)
+    return next((r.confusable.get(name, []) for r in found), [])

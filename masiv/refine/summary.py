@@ -13,7 +13,7 @@ from masiv.refine.evidence import excess
 from masiv.refine.loop import STOP_GAP
 from masiv.refine.model import Experiment, effect_parameters
 from masiv.refine.refit import Fitted, rms_mm, split
-from masiv.refine.rounds import Round
+from masiv.refine.rounds import Round, like_accepted
 from masiv.refine.score import Candidate
 from masiv.refine.stage import Refined
 
@@ -45,7 +45,7 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
         "residual_mm": {"fit": outcome.before.fit_mm, "held_out": outcome.before.held_out_mm},
         "candidates": [_candidate(c, first) for c in first.candidates] if first else [],
         "accepted": [
-            {**_accepted(name, outcome.after), "confusable_with": _alike(name, outcome.rounds)}
+            {**_accepted(name, outcome.after), "confusable_with": like_accepted(name, outcome.rounds)}
             for name in outcome.after.model.effects
         ],
         "stop_gap": None if outcome.gap is None else _stop_gap(outcome.gap),
@@ -97,14 +97,6 @@ def _candidate(candidate: Candidate, first: Round) -> dict[str, Any]:
         "confusable_with": first.confusable.get(candidate.effect, []),
         "looks_like": effect.looks_like,
     }
-
-
-def _alike(name: str, rounds: list[Round]) -> list[str]:
-    """What explains the motion as well as ``name``, in the round that accepted it."""
-    found = [
-        r.confusable.get(name, []) for r in rounds if r.accepted is not None and r.accepted.candidate.effect == name
-    ]
-    return found[0] if found else []
 
 
 def _accepted(name: str, fitted: Fitted) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess
 from masiv.refine.loop import STOP_GAP
 from masiv.refine.refit import Fitted, rms_mm, split
-from masiv.refine.rounds import Round
+from masiv.refine.rounds import Round, like_accepted
 from masiv.refine.score import Candidate
 from masiv.refine.simulated import Term
 from masiv.refine.summary import ADDED, NOTHING, UNEXPLAINED
@@ -121,6 +121,7 @@ def _accepted(found: Found, term: Term) -> dict[str, Any]:
         "theta": {_short(term, p.name): after.values[p.name] for p in term.parameters},
         "stderr": {_short(term, p.name): after.stderr.get(p.name) for p in term.parameters},
         "unit": {_short(term, p.name): term.units[p.name] for p in term.parameters},
+        "confusable_with": like_accepted(term.name, found.outcome.rounds),
     }
     if isinstance(found, Refined) and (place := place_of(found.simulation, term.name, after)) is not None:
         out["place_in_body"] = {"value": list(place), "unit": "m"}
