@@ -82,7 +82,7 @@ def found(*motions, **settings):
 
 
 def test_undeclared_drag_is_named_measured_and_confirmed():
-    refined, document = found(observed({"linear_drag": [1.0]}), max_effects=1)
+    refined, document = found(observed({"linear_drag": [1.0]}))
     assert document["verdict"] == "effect added"
     assert [a["effect"] for a in document["accepted"]] == ["linear_drag"]
     assert document["accepted"][0]["theta"]["rate"] == pytest.approx(1.0, rel=0.1)
