@@ -47,6 +47,13 @@ def running_arch() -> str:
     return _started or "cpu"
 
 
+def threads() -> int:
+    """Threads of Taichi's kernels on a CPU."""
+    import taichi as ti
+
+    return ti.lang.impl.current_cfg().cpu_max_num_threads
+
+
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Run torch on ``count`` threads for a while. Small networks between Taichi kernels are faster on one: two pools of

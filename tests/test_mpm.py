@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from masiv.effects.active import ActiveEffects, BoundEffects
 from masiv.errors import NonFiniteError
 from masiv.identify.start import with_scales
 from masiv.materials.classical import ClassicalLaw
@@ -182,6 +183,19 @@ def test_rollout_is_bit_reproducible_and_segments_do_not_change_it():
     for other in (second, segmented):
         assert torch.equal(first[0], other[0])
         assert all(torch.equal(a, b) for a, b in zip(first[1], other[1], strict=True))
+
+
+def test_substeps_launched_at_once_and_one_by_one_and_in_parts_are_the_same(monkeypatch):
+    start = State(*(t.float() for t in blob(200, height=0.05).tensors()))
+    law, nothing = elastic(), ActiveEffects((), None)
+    ends = []
+    for serial in (10**6, 0):
+        monkeypatch.setattr("masiv.mpm.simulator.SERIAL", serial)
+        ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
+    monkeypatch.setattr(BoundEffects, "none", False)  # launch by launch, as with effects
+    ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
+    for end in ends[1:]:
+        np.testing.assert_allclose(end.numpy(), ends[0].numpy(), atol=1e-6)
 
 
 def test_result_does_not_depend_on_the_mass_of_a_particle():

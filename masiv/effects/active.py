@@ -123,6 +123,11 @@ class BoundEffects:
         self.force = None if force is None else force.detach().to(self.dtype).contiguous()
         self.push = None if force is None else _force_kernels(mpm)
 
+    @property
+    def none(self) -> bool:
+        """Whether nothing acts in a substep."""
+        return not self.kernels and self.push is None
+
     def write(self) -> None:
         """Fill the fields, which rollouts of one capacity share, and start the sums of gradients at zero."""
         for kernels, values in zip(self.kernels, self.values, strict=True):

@@ -38,25 +38,16 @@ class ClassicalKernels:
             for c in ti.static(range(self.n_coefficients)):
                 out[p, c] = self.coefficients.grad[p][c]
 
+    @ti.func
+    def particle(self, s: ti.i32, p: ti.i32):
+        f, tau = self.law(self.mpm.trial_gradient[s, p], self.coefficients[p])
+        self.mpm.deformation_gradient[s, p] = f
+        self.mpm.kirchhoff_stress[s, p] = tau
+
     @ti.kernel
     def forward(self, s: ti.i32, count: ti.i32):
         for p in range(count):
-            f, tau = self.law(self.mpm.trial_gradient[s, p], self.coefficients[p])
-            self.mpm.deformation_gradient[s, p] = f
-            self.mpm.kirchhoff_stress[s, p] = tau
-
-    @ti.kernel
-    def forward_p2g(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
-        """``forward`` and the P2G of a CPU in one pass: a launch and a trip through memory less."""
-        ti.loop_config(block_dim=1)
-        for t in range(self.mpm.chunks):
-            for n in range(nodes):
-                self.mpm.private[t, n] = ti.Vector.zero(self.mpm.real, 4)
-            for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
-                f, tau = self.law(self.mpm.trial_gradient[s, p], self.coefficients[p])
-                self.mpm.deformation_gradient[s, p] = f
-                self.mpm.kirchhoff_stress[s, p] = tau
-                self.mpm.p2g_particle(t, s, p)
+            self.particle(s, p)
 
     @ti.kernel
     def pointwise(self, count: ti.i32):

@@ -174,17 +174,6 @@ class NeuralKernels:
         for p in range(count):
             self.particle(s, p)
 
-    @ti.kernel
-    def forward_p2g(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
-        """``forward`` and the P2G of a CPU in one pass."""
-        ti.loop_config(block_dim=1)
-        for t in range(self.mpm.chunks):
-            for n in range(nodes):
-                self.mpm.private[t, n] = ti.Vector.zero(self.mpm.real, 4)
-            for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
-                self.particle(s, p)
-                self.mpm.p2g_particle(t, s, p)
-
     @ti.func
     def particle_adjoint(self, t: ti.i32, s: ti.i32, p: ti.i32):
         f, trial = self.mpm.deformation_gradient[s, p], self.mpm.trial_gradient[s, p]

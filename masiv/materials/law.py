@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,14 @@ import torch
 
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
+    from masiv.kernels.substep import SubstepKernels
+
+
+@functools.lru_cache(maxsize=32)
+def _substeps(mpm, law, serial: bool) -> SubstepKernels:
+    from masiv.kernels.substep import SubstepKernels
+
+    return SubstepKernels(mpm, law, serial)
 
 
 class BoundLaw(ABC):
@@ -23,6 +32,10 @@ class BoundLaw(ABC):
         """``forward``, then the transfer to the grid; a law that can do both in one pass over the particles does."""
         self.forward(s, count)
         mpm.p2g(s, count, nodes)
+
+    def substeps(self, mpm: MpmKernels, serial: bool) -> SubstepKernels | None:
+        """Kernels of whole substeps with this law, ready to be launched; None where it has none, and on a GPU."""
+        return None
 
     @abstractmethod
     def backward(self, s: int, count: int) -> None:
@@ -52,11 +65,17 @@ class SharedBoundLaw(BoundLaw):
         self.kernels.forward(s, count)
 
     def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
-        if mpm.gpu:
+        whole = self.substeps(mpm, True)
+        if whole is None:
             super().p2g(mpm, s, count, nodes)
         else:
-            self._own()
-            self.kernels.forward_p2g(s, count, nodes)
+            whole.transfer(s, count, nodes)
+
+    def substeps(self, mpm: MpmKernels, serial: bool) -> SubstepKernels | None:
+        if mpm.gpu:
+            return None
+        self._own()
+        return _substeps(mpm, self.kernels, serial)
 
     def backward(self, s: int, count: int) -> None:
         self._own()

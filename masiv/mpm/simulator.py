@@ -15,6 +15,8 @@ from masiv.errors import MasivError, NonFiniteError
 from masiv.materials.law import Law
 
 WINDOW_EVERY = 8  # substeps between two fits of the grid's window to the particles
+SERIAL = 3000
+"""Particles up to which one thread that is launched once is faster than several that are launched for each substep."""
 CONTACTS = ("sticky", "release", "slip", "none")
 
 
@@ -224,12 +226,7 @@ class Recording:
             self.windows[start + begin] = window
             nodes = sim.set_window(window)
             k.clear_fault()
-            for s in range(begin, end):
-                offset = self._log(s, nodes)
-                self.effects.p2g(self.bound, s, nodes)
-                self.effects.grid_update(offset, self._instant(start + s))
-                k.g2p(s, sim.count)
-                self.effects.after(s)
+            self._substeps(start, begin, end, nodes)
             self.logs[end] = self.logs[begin] + (end - begin) * nodes
             too_fast, outside = k.read_fault()
             if too_fast >= 0:
@@ -239,6 +236,22 @@ class Recording:
             if outside < 0:
                 return
         raise NonFiniteError(start + (outside >> 32), outside & 0xFFFFFFFF, "non-finite position")
+
+    def _substeps(self, start: int, begin: int, end: int, nodes: int) -> None:
+        """Substeps begin…end-1 within one window."""
+        count, k = self.simulator.count, self.simulator.k
+        serial = count <= SERIAL  # whatever the number of threads: the two kernels round differently
+        whole = self.bound.substeps(k, serial) if self.effects.none else None
+        if whole is not None:
+            at_once = end - begin if serial else 1
+            for s in range(begin, end, at_once):
+                whole.advance(s, s + at_once, count, nodes, self.logs[begin] + (s - begin) * nodes)
+            return
+        for s in range(begin, end):
+            self.effects.p2g(self.bound, s, nodes)
+            self.effects.grid_update(self._log(s, nodes), self._instant(start + s))
+            k.g2p(s, count)
+            self.effects.after(s)
 
     def _instant(self, step: int) -> float:
         return self.time + step * self.simulator.substep

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
+
 import numpy as np
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.identify.classical_fit import FamilyFit, fit_family, ranked
 from masiv.identify.families import FAMILIES
-from masiv.identify.problem import Problem
-from masiv.progress import Progress
+from masiv.identify.problem import Motion, Problem
+from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model, Simulation, parameters
 from masiv.refine.refit import Fitted, column, full_fit, softness, started, summarised
+from masiv.refine.tasks import demanded, side_by_side
+from masiv.workers import Failed, Workers
 
 SHORT, HALF = 1 / 3, 1 / 2
 
@@ -25,6 +29,7 @@ def baselines(
     config: RefineConfig,
     checkpoint: Checkpoint,
     progress: Progress,
+    workers: Workers | None = None,
 ) -> list[Fitted]:
     """Fits of the classical laws that explain the motion best, without effects.
 
@@ -32,35 +37,57 @@ def baselines(
     ``config.families`` laws may compete, those best in a short fit to ``fewer`` do. They are fitted to ``few``,
     then to all experiments. Raises MasivError where no law explains the motion.
     """
+    workers = workers or Workers()
     motion = simulation.experiments[0].motion
     kinds = [n for n in FAMILIES if not config.laws or n in config.laws]
+    progress("refine: laws without effects", 0, len(kinds), ", ".join(kinds))
     if len(kinds) > config.families:
-        short: list[FamilyFit] = []
-        for kind in kinds:
-            try:
-                short.append(fit_family(kind, fewer, motion, first_frames, Checkpoint(None), progress, share=SHORT))
-            except MasivError as failed:
-                progress(f"refine: {kind}", 1, 1, str(failed))
-        if not short:
-            raise MasivError("refine: no classical law explains the motion; look at its trajectory in the report")
+        found = workers.map(_fitted, [(kind, fewer, motion, first_frames, SHORT) for kind in kinds])
+        short = list(_known(kinds, found, progress))
         kinds = [f.kind for f in ranked(short)[: config.families]]
-    out = []
-    for done, kind in enumerate(kinds):
-        found = fit_family(kind, few, motion, first_frames, checkpoint, progress, share=HALF)
-        out.append(_joint(simulation, found, config))
-        progress("refine: laws without effects", done + 1, len(kinds), f"{kind}: {out[-1].fit_mm:.1f} mm")
-    return out
+    saved = {kind: FamilyFit(**state) for kind, state in (checkpoint.load() or {}).items()}
+    missing = [kind for kind in kinds if kind not in saved]
+    found = workers.map(_fitted, [(kind, few, motion, first_frames, HALF) for kind in missing])
+    for fit in _known(missing, found, progress) if missing else ():
+        saved[fit.kind] = fit
+        checkpoint.save({kind: fit.state() for kind, fit in saved.items()})
+    models = [_carried(simulation, saved[kind]) for kind in kinds if kind in saved]
+    fits = side_by_side(workers, simulation, derived, [(*m, config.baseline_rollouts) for m in models])
+    return [demanded(fitted) for fitted in fits]
 
 
-def _joint(simulation: Simulation, found: FamilyFit, config: RefineConfig) -> Fitted:
-    """The fit of the first experiment, carried to all."""
+def _fitted(kind: str, problem: Problem, motion: Motion, first_frames: int, share: float) -> FamilyFit:
+    return fit_family(kind, problem, motion, first_frames, Checkpoint(None), silent, share=share)
+
+
+def _known(kinds: Sequence[str], found: Iterable[FamilyFit | Failed], progress: Progress) -> Iterator[FamilyFit]:
+    """Those that explain the motion. Raises MasivError where none does."""
+    any_of_them = False
+    for done, (kind, fit) in enumerate(zip(kinds, found, strict=True)):
+        note = fit.reason if isinstance(fit, Failed) else f"{1e3 * fit.error_m:.1f} mm"
+        progress("refine: laws without effects", done + 1, len(kinds), f"{kind}: {note}")
+        if not isinstance(fit, Failed):
+            any_of_them = True
+            yield fit
+    if not any_of_them:
+        raise MasivError("refine: no classical law explains the motion; look at its trajectory in the report")
+
+
+def _carried(simulation: Simulation, found: FamilyFit) -> tuple[Model, dict[str, float]]:
+    """The model that fits the first experiment, and its values, to begin with in all."""
     first = simulation.experiments[0].name
     family = FAMILIES[found.kind].scaled(simulation.experiments[0].problem.scene.density)
     law = {p.name for p in family.parameters}
     values = {name if name in law else f"{name}@{first}": value for name, value in found.values.items()}
     model = Model(family, found.contact)
+    simulation.settle(model, values)
+    return model, values
+
+
+def derived(simulation: Simulation, model: Model, values: dict[str, float], rollouts: int) -> Fitted:
+    """``values`` with derivatives; fitted to all experiments where there are several."""
     if len(simulation.experiments) > 1:
-        return full_fit(simulation, model, values, budget=config.baseline_rollouts)
+        return full_fit(simulation, model, values, budget=rollouts)
     params = started(parameters(model, simulation.experiments), values)
     values = {p.name: p.start for p in params}
     residual = simulation.residual(model, values)

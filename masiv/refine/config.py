@@ -10,6 +10,11 @@ class RefineConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
+    processes: int = Field(
+        0, ge=0, le=32,
+        description="processes that fit causes side by side; 0: one for each core that Taichi may use, four at most; "
+        "on a GPU always one",
+    )  # fmt: skip
     particles: int = Field(1500, ge=100, description="particles of the rollouts")
     search_particles: int = Field(500, ge=100, description="particles of the short fits that choose the laws")
     samples_per_frame: int = Field(2, ge=1, le=16, description="instants per frame at which motions are compared")

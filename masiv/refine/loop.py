@@ -18,6 +18,8 @@ from masiv.refine.rounds import TELLS_APART, Round, Trial, confusable
 from masiv.refine.score import Candidate, score
 from masiv.refine.second_look import second_look
 from masiv.refine.simulated import Simulated
+from masiv.refine.tasks import demanded, ranked, side_by_side
+from masiv.workers import Failed, Workers
 
 Say = Callable[[str, int, int, str], None]
 STOP_GAP = "smooth_force"
@@ -38,22 +40,28 @@ class Outcome:
     gap: Fitted | None = None
 
 
-def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: RefineConfig, say: Say) -> Outcome:
+def close_loop(
+    simulation: Simulated, baselines: Sequence[Fitted], config: RefineConfig, say: Say, workers: Workers | None = None
+) -> Outcome:
     """Add effects to the best of ``baselines`` (one a law, without effects) until none is confirmed, or the residual is
-    near the noise. Gives the experiments of ``simulation`` their sigma."""
+    near the noise. Gives the experiments of ``simulation`` their sigma, and ``workers`` what need not wait."""
+    workers = workers or Workers()
     least = min(baselines, key=lambda f: f.cost)
     observation = [e.sigma for e in simulation.experiments]
     weigh(simulation, least, observation)
     soft = max(softness(simulation.residual(least.model, least.values)), SOFT * simulation.experiments[0].noise)
-    rivals = []
-    for done, base in enumerate(baselines):
-        say("refine: weigh", done, len(baselines), base.model.family.kind)
-        rivals.append(reweighted(simulation, base, steps=CHORD_STEPS, soft=soft))
-    rivals = ordered(rivals)[: config.families]
+    say("refine: weigh", 0, 1, "")
+    rivals = ordered(
+        [
+            demanded(f)
+            for f in side_by_side(workers, simulation, reweighted, [(b, CHORD_STEPS, soft) for b in baselines])
+        ]
+    )[: config.families]
+    say("refine: weigh", 1, 1, "")
     before = current = rivals[0]
     rounds: list[Round] = []
     while len(rounds) < config.max_effects and above_noise(current, simulation.experiments, config):
-        done = _round(simulation, current, rivals, soft, config, say)
+        done = _round(simulation, current, rivals, soft, config, say, workers)
         rounds.append(done)
         if done.accepted is None:
             break
@@ -67,7 +75,7 @@ def close_loop(simulation: Simulated, baselines: Sequence[Fitted], config: Refin
         rivals = [current]
         if excess(current, simulation.experiments) < config.unexplained:
             if look:
-                looks = second_look(simulation, current, done, soft, config, say)
+                looks = second_look(simulation, current, done, soft, config, say, workers)
                 rounds += looks
                 current = _told_apart(current, done, looks)
             break
@@ -134,6 +142,7 @@ def _round(
     soft: float,
     config: RefineConfig,
     say: Say,
+    workers: Workers,
 ) -> Round:
     trials: list[Trial] = []
     ranking: list[Candidate] = []
@@ -145,29 +154,27 @@ def _round(
             break
         early = simulation.early(base)
         start = base if not early else carried(early[0], base, soft)
-        candidates = score(
-            early[0] if early else simulation, start, soft=soft, names=names or config.effects or None,
+        candidates = ranked(
+            workers, early[0] if early else simulation, start, soft=soft,
+            names=names or config.effects or simulation.candidates(base.model),
             progress=lambda n, i, k, label=label: say(label, i, k, n),
         )  # fmt: skip
         say(label, 1, 1, candidates[0].effect if candidates else "none")
         ranking = ranking or candidates
         worth = [c for c in candidates if c.explained >= config.least_explained][: config.shortlist]
         worth = [c for c in worth if early or in_reach(c, base, trials)]
-        for done, candidate in enumerate(worth):
-            label = f"refine: fit effects, {base.model.family.kind}"
-            say(label, done, len(worth), candidate.effect)
-            try:
-                fitted = refit(early[0] if early else simulation, start, candidate, soft)
-                for longer in (*early[1:], simulation) if early else ():
-                    fitted = carried(longer, fitted, soft)
+        label = f"refine: fit effects, {base.model.family.kind}"
+        fits = side_by_side(workers, simulation, _fitted, [(early, start, candidate, soft) for candidate in worth])
+        say(label, 0, len(worth), ", ".join(c.effect for c in worth))
+        for done, (candidate, fitted) in enumerate(zip(worth, fits, strict=True)):
+            if isinstance(fitted, Failed):
+                say(label, done + 1, len(worth), f"{candidate.effect}: {fitted.reason}")
+            else:
                 trials.append(Trial(candidate, fitted))
-            except MasivError as failed:
-                say(label, done, len(worth), f"{candidate.effect}: {failed}")
-        if worth:
-            say(f"refine: fit effects, {base.model.family.kind}", len(worth), len(worth), "")
+                say(label, done + 1, len(worth), candidate.effect)
     _rank(trials)
     if trials:
-        _second_chance(simulation, trials, soft, say)
+        _second_chance(simulation, trials, soft, say, workers)
         _rank(trials)
     alike = confusable(ranking, trials, config.confusable)
     accepted = None
@@ -200,7 +207,17 @@ def _rank(trials: list[Trial]) -> None:
     trials.sort(key=lambda t: rank[id(t.fitted)])
 
 
-def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, say: Say) -> None:
+def _fitted(
+    simulation: Simulated, early: Sequence[Simulated], start: Fitted, candidate: Candidate, soft: float
+) -> Fitted:
+    """``start`` with the candidate, through the ``early`` simulations first."""
+    fitted = refit(early[0] if early else simulation, start, candidate, soft)
+    for longer in (*early[1:], simulation) if early else ():
+        fitted = carried(longer, fitted, soft)
+    return fitted
+
+
+def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, say: Say, workers: Workers) -> None:
     """Fit what is simpler than the best trial, with the same law, again from where the best one ended: a flexible cause
     that found the right law and launch must not win for that alone."""
     best = trials[0].fitted
@@ -208,19 +225,22 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
         t for t in trials[1:]
         if t.fitted.model.family.kind == best.model.family.kind and len(t.fitted.parameters) < len(best.parameters)
     ]  # fmt: skip
-    for done, trial in enumerate(simpler):
-        say("refine: fit simpler effects again", done, len(simpler), trial.candidate.effect)
-        shared = {p.name for p in trial.fitted.parameters} & {p.name for p in best.parameters}
-        values = {**trial.fitted.values, **{name: best.values[name] for name in shared}}
-        strengths = simulation.term(trial.candidate.effect).strengths
-        budget = 2 * (len(trial.fitted.parameters) + 2)
-        try:
-            values = strengths_alone(simulation, trial.fitted.model, values, strengths, soft)
-            held = held_in(simulation, trial.fitted)
-            again = full_fit(simulation, trial.fitted.model, values, budget=budget, soft=soft, held=held)
-        except MasivError:
-            continue
-        trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
+    fits = side_by_side(
+        workers, simulation, _fitted_from, [(t.fitted, t.candidate.effect, best, soft) for t in simpler]
+    )
+    for done, (trial, again) in enumerate(zip(simpler, fits, strict=True)):
+        say("refine: fit simpler effects again", done + 1, len(simpler), trial.candidate.effect)
+        if not isinstance(again, Failed):
+            trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
+
+
+def _fitted_from(simulation: Simulated, fitted: Fitted, name: str, best: Fitted, soft: float) -> Fitted:
+    """``fitted``, a model with the term ``name``, from where what it shares with ``best`` ended."""
+    shared = {p.name for p in fitted.parameters} & {p.name for p in best.parameters}
+    values = {**fitted.values, **{n: best.values[n] for n in shared}}
+    values = strengths_alone(simulation, fitted.model, values, simulation.term(name).strengths, soft)
+    held, budget = held_in(simulation, fitted), 2 * (len(fitted.parameters) + 2)
+    return full_fit(simulation, fitted.model, values, budget=budget, soft=soft, held=held)
 
 
 def _freed(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:

@@ -115,10 +115,16 @@ class Simulation:
 
     STABLE = 1.4
 
-    def __init__(self, experiments: Sequence[Experiment]) -> None:
+    def __init__(self, experiments: Sequence[Experiment], steps: dict[tuple[int, str], int] | None = None) -> None:
         self.experiments = tuple(experiments)
-        self.steps: dict[tuple[int, str], int] = {}
+        self.steps = {} if steps is None else steps
         self.rollouts = 0
+
+    def settle(self, model: Model, values: Mapping[str, float]) -> None:
+        """Hold the substeps of the model's family at what its law with ``values`` needs, if they are not held yet."""
+        law = law_of(model.family, dict(values))
+        for index, experiment in enumerate(self.experiments):
+            self.steps.setdefault((index, model.family.kind), experiment.problem.substeps(law))
 
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
         """See ``parameters``."""
@@ -152,7 +158,7 @@ class Simulation:
             shows = int(np.argmax(away > SHOWS)) // e.problem.samples + 2
             horizons.append((min(shows + 1, e.fitted), (shows + 1 + e.fitted) // 2))
         return [
-            Simulation([replace(e, fitted=h[k]) for e, h in zip(self.experiments, horizons, strict=True)])
+            Simulation([replace(e, fitted=h[k]) for e, h in zip(self.experiments, horizons, strict=True)], self.steps)
             for k in range(2)
         ]
 

@@ -219,7 +219,7 @@ def best_strength(
     return best, least
 
 
-def reweighted(simulation: Simulated, base: Fitted, *, steps: int, soft: float) -> Fitted:
+def reweighted(simulation: Simulated, base: Fitted, steps: int, soft: float) -> Fitted:
     """``base`` fitted again to the residual as ``simulation`` weighs it now; fresh derivatives before and after."""
     params = started(simulation.parameters(base.model), base.values)
     values = dict(base.values)

@@ -12,14 +12,15 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from masiv.errors import MasivError
 from masiv.refine.add_effect import refit
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import beyond_possible, sigmas_from_zero
 from masiv.refine.refit import Fitted, carried
 from masiv.refine.rounds import Round, Trial, confusable
-from masiv.refine.score import score
+from masiv.refine.score import Candidate
 from masiv.refine.simulated import Simulated, Watched
+from masiv.refine.tasks import ranked, side_by_side
+from masiv.workers import Failed, Workers
 
 Say = Callable[[str, int, int, str], None]
 GLIMPSE = 0.05
@@ -28,7 +29,13 @@ SHORTLIST = 2
 
 
 def second_look(
-    simulation: Simulated, current: Fitted, first: Round, soft: float, config: RefineConfig, say: Say
+    simulation: Simulated,
+    current: Fitted,
+    first: Round,
+    soft: float,
+    config: RefineConfig,
+    say: Say,
+    workers: Workers,
 ) -> list[Round]:
     """Rounds on top of ``current``, the model with what ``first`` accepted, and of its closest rival: the best of all
     trials is accepted in one of them, or nothing is."""
@@ -39,7 +46,7 @@ def second_look(
         if t.passes and t.fitted.model.family is here.family and t.fitted.model.effects != here.effects
     ]
     bases = [current, *(carried(simulation, rival, soft) for rival in rivals[:1])]
-    rounds = [_round(simulation, base, current, soft, config, say) for base in bases]
+    rounds = [_round(simulation, base, current, soft, config, say, workers) for base in bases]
     trials = [t for r in rounds for t in r.trials]
     if trials:
         samples = min((t.fitted for t in trials), key=lambda f: f.cost).samples
@@ -49,28 +56,33 @@ def second_look(
     return rounds
 
 
-def _round(simulation: Simulated, base: Fitted, best: Fitted, soft: float, config: RefineConfig, say: Say) -> Round:
+def _round(
+    simulation: Simulated, base: Fitted, best: Fitted, soft: float, config: RefineConfig, say: Say, workers: Workers
+) -> Round:
     beside = ", ".join(base.model.effects)
     names = [n for n in simulation.candidates(base.model) if len(simulation.term(n).parameters) == 1]
     names = [n for n in names if n in config.effects or not config.effects]
     label = f"refine: rank what may act beside {beside}"
-    candidates = score(
-        simulation, base, soft=soft, names=names, progress=lambda n, i, k: say(label, i, k, n)
-    ) if names else []  # fmt: skip
+    candidates = ranked(
+        workers, simulation, base, soft=soft, names=names, progress=lambda n, i, k: say(label, i, k, n)
+    )  # fmt: skip
     say(label, 1, 1, candidates[0].effect if candidates else "none")
     trials = []
-    for candidate in [c for c in candidates if c.explained >= GLIMPSE][:SHORTLIST]:
-        label = f"refine: fit {candidate.effect} beside {beside}"
-        say(label, 0, 1, "")
-        try:
-            trial = Trial(candidate, carried(simulation, refit(simulation, base, candidate, soft), soft))
-        except MasivError as failed:
-            say(label, 1, 1, str(failed))
+    worth = [c for c in candidates if c.explained >= GLIMPSE][:SHORTLIST]
+    label = f"refine: fit effects beside {beside}"
+    say(label, 0, len(worth), ", ".join(c.effect for c in worth))
+    fits = side_by_side(workers, simulation, _fitted, [(base, candidate, soft) for candidate in worth])
+    for done, (candidate, fitted) in enumerate(zip(worth, fits, strict=True)):
+        if isinstance(fitted, Failed):
+            say(label, done + 1, len(worth), f"{candidate.effect}: {fitted.reason}")
             continue
-        trial.reasons = objections(simulation, best, trial.fitted, config)
-        trials.append(trial)
-        say(label, 1, 1, f"{trial.fitted.fit_mm:.1f} mm")
+        trials.append(Trial(candidate, fitted, objections(simulation, best, fitted, config)))
+        say(label, done + 1, len(worth), f"{candidate.effect}: {fitted.fit_mm:.1f} mm")
     return Round(base, candidates, trials, None, confusable(candidates, trials, config.confusable))
+
+
+def _fitted(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float) -> Fitted:
+    return carried(simulation, refit(simulation, base, candidate, soft), soft)
 
 
 def objections(simulation: Simulated, before: Fitted, after: Fitted, config: RefineConfig) -> list[str]:

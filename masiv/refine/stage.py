@@ -24,6 +24,7 @@ from masiv.refine.propose import Proposal, propose
 from masiv.refine.refit import Fitted
 from masiv.scene.scene import Scene
 from masiv.twin import Twin, TwinEffect
+from masiv.workers import Workers, processes_wanted
 
 COMPETITORS = {
     "jelly": ("neo_hookean", "von_mises"),
@@ -92,18 +93,20 @@ def refine(
         ]
         simulation = Simulation([experiment for experiment, *_ in made])
         _, few, fewer, launch = made[0]
-        fits = baselines(
-            simulation,
-            few,
-            fewer,
-            min(launch.last_frame + 2, few.frames),
-            config,
-            checkpoint or Checkpoint(None),
-            progress,
-        )
-        if dry_run:
-            config = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
-        outcome = close_loop(simulation, fits, config, progress)
+        with Workers(processes_wanted(config.processes)) as workers:
+            fits = baselines(
+                simulation,
+                few,
+                fewer,
+                min(launch.last_frame + 2, few.frames),
+                config,
+                checkpoint or Checkpoint(None),
+                progress,
+                workers,
+            )
+            if dry_run:
+                config = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
+            outcome = close_loop(simulation, fits, config, progress, workers)
         before = simulation.fields(outcome.before.model, outcome.before.values, held_out=True)
         final = outcome.gap or outcome.after
         after = simulation.fields(final.model, final.values, held_out=True)

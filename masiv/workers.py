@@ -1,0 +1,124 @@
+"""Simulations side by side: processes that each have a Taichi of their own, on one thread.
+
+A rollout of a few thousand particles gains little from a second thread, and two rollouts in two processes take as
+long as one. What a task gives is the same to the bit, wherever it runs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from masiv import runtime
+from masiv.errors import MasivError
+
+ONE_THREAD = {
+    "TI_CPU_MAX_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+AT_MOST = 4
+
+
+def processes_wanted(asked: int) -> int:
+    """``asked``, or where that is 0 one process a core that Taichi may use, four at most; one on a GPU."""
+    if runtime.running_arch() != "cpu":
+        return 1
+    return asked or min(runtime.threads(), AT_MOST)
+
+
+class Failed:
+    """What a task that raised a MasivError gives."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+
+
+class Workers:
+    """``processes`` (1: this one) that run tasks. Use as a context; the processes start with the first tasks.
+
+    A script that uses more than one needs ``if __name__ == "__main__":`` around what it does, as ever with processes.
+    """
+
+    def __init__(self, processes: int = 1) -> None:
+        self.processes = processes
+        self._pool: Any = None
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def map(self, function: Callable, tasks: Iterable[tuple]) -> Iterator[Any]:
+        """``function(*task)`` of each, in order, or ``Failed``. The function and its arguments must be picklable.
+
+        Raises MasivError where a process dies."""
+        tasks = list(tasks)
+        if self.processes == 1 or len(tasks) == 1:
+            yield from (attempt(function, task) for task in tasks)
+            return
+        from concurrent.futures.process import BrokenProcessPool
+
+        futures = [self._started().submit(attempt, function, task) for task in tasks]
+        try:
+            for future in futures:
+                yield future.result()
+        except BrokenProcessPool as died:
+            raise MasivError("a worker process died, of too little memory perhaps: set refine.processes to 1") from died
+        finally:
+            for future in futures:
+                future.cancel()
+
+    def _started(self) -> Any:
+        if self._pool is None:
+            import multiprocessing
+            from concurrent.futures import ProcessPoolExecutor
+
+            spawn = multiprocessing.get_context("spawn")  # Taichi's threads do not survive a fork
+            self._pool = ProcessPoolExecutor(self.processes, spawn, _start, (runtime.running_arch(),))
+            with _environment(ONE_THREAD):  # which a process reads when it starts
+                for _ in range(self.processes):
+                    self._pool.submit(_nothing)
+        return self._pool
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start(arch: str) -> None:
+    import multiprocessing.util
+
+    import torch
+
+    ti = runtime.start(arch)
+    torch.set_num_threads(1)
+    # What atexit has is not called in such a process; this writes the kernel cache.
+    multiprocessing.util.Finalize(None, ti.reset, exitpriority=1)
+
+
+def _nothing() -> None:
+    pass
+
+
+def attempt(function: Callable, task: tuple) -> Any:
+    """``function(*task)``, or ``Failed`` where that raises a MasivError."""
+    try:
+        return function(*task)
+    except MasivError as failed:
+        return Failed(str(failed))

@@ -1,0 +1,102 @@
+"""Simulations in processes of their own: the same to the bit, in order, and what fails says so."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+from test_refine import FITTED, OMEGA, VELOCITY, observed, scene
+
+from masiv import runtime
+from masiv.errors import MasivError
+from masiv.identify.config import IdentifyConfig
+from masiv.identify.families import FAMILIES
+from masiv.mpm.config import SimulatorConfig
+from masiv.refine.baselines import derived
+from masiv.refine.config import RefineConfig
+from masiv.refine.model import Model, Simulation, parameters
+from masiv.refine.observed import SampledMotion
+from masiv.refine.prepare import experiment_of
+from masiv.refine.tasks import ranked, side_by_side
+from masiv.workers import Failed, Workers, processes_wanted
+
+pytestmark = pytest.mark.usefixtures("taichi")
+
+
+@pytest.fixture(scope="module")
+def two():
+    with Workers(2) as workers:
+        yield workers
+
+
+def halved(number):
+    if number % 2:
+        raise MasivError(f"{number} is odd")
+    return number // 2, os.getpid()
+
+
+def dies():
+    os._exit(1)
+
+
+def threads():
+    return runtime.threads(), os.environ["OMP_NUM_THREADS"]
+
+
+def quiet(*_):
+    pass
+
+
+def test_results_come_in_order_and_a_failure_is_one_of_them(two):
+    found = list(two.map(halved, [(k,) for k in range(10)]))
+    assert [f[0] for f in found[::2]] == [0, 1, 2, 3, 4]
+    assert [f.reason for f in found[1::2]] == [f"{k} is odd" for k in (1, 3, 5, 7, 9)]
+    assert os.getpid() not in {f[1] for f in found[::2]}
+    assert all(isinstance(f, Failed) for f in Workers(1).map(halved, [(1,), (3,)]))
+
+
+def test_each_process_runs_on_one_thread_and_this_one_as_before(two):
+    before = dict(os.environ)
+    assert set(two.map(threads, [()] * 4)) == {(1, "1")}
+    assert dict(os.environ) == before
+
+
+def test_a_process_that_dies_is_told_of():
+    with Workers(2) as workers, pytest.raises(MasivError, match=r"set refine\.processes to 1"):
+        list(workers.map(dies, [(), ()]))
+
+
+def test_as_many_as_asked_or_as_there_are_cores():
+    assert processes_wanted(3) == 3
+    assert 1 <= processes_wanted(0) <= 4
+
+
+def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
+    motion = observed({"linear_drag": [1.0]})
+    first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
+    config = RefineConfig(particles=200, samples_per_frame=1)
+    experiment, *_ = experiment_of(
+        "run", scene(), first, motion, IdentifyConfig(contact="sticky"), SimulatorConfig(), config, seed=0
+    )
+    simulation = Simulation([experiment])
+    model = Model(FAMILIES["neo_hookean"], "sticky")
+    values = {p.name: p.start for p in parameters(model, simulation.experiments)}
+    values |= {f"velocity_{a}@run": v for a, v in zip("xyz", VELOCITY, strict=True)}
+    values |= {f"omega_{a}@run": v for a, v in zip("xyz", OMEGA, strict=True)}
+    simulation.settle(model, values)
+    names = ["linear_drag", "gravity_scale", "body_force", "viscosity"]
+    found = []
+    for workers in (Workers(1), two):
+        before = simulation.rollouts
+        (base,) = side_by_side(workers, simulation, derived, [(model, values, 0)])
+        ranking = ranked(workers, simulation, base, soft=1.0, names=names, progress=quiet)
+        found.append((base, ranking, simulation.rollouts - before))
+    (base, ranking, count), (other_base, other, other_count) = found
+    assert count == other_count == len(base.parameters) + 2 + 6
+    np.testing.assert_array_equal(base.jacobian, other_base.jacobian)
+    assert [c.effect for c in ranking] == [c.effect for c in other]
+    assert ranking[0].effect == "linear_drag"
+    for a, b in zip(ranking, other, strict=True):
+        assert a.theta == b.theta
+        np.testing.assert_array_equal(a.columns, b.columns)
