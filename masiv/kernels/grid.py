@@ -83,11 +83,6 @@ class GridKernels:
         else:
             self.private[t, node] = self.private[t, node] + value
 
-    @ti.kernel
-    def set_window(self, ox: ti.i32, oy: ti.i32, oz: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
-        self.window_origin[None] = ti.Vector([ox, oy, oz])
-        self.window_shape[None] = ti.Vector([nx, ny, nz])
-
     @ti.func
     def node_height(self, row: ti.i32):
         """Lattice index along y of a row of nodes (all k of one i, j); the ground plane is at 0."""

@@ -161,13 +161,20 @@ class MpmKernels(GridKernels):
         return out
 
     @ti.kernel
-    def clear_fault(self):
+    def set_window(self, ox: ti.i32, oy: ti.i32, oz: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
+        """Make this the window; no fault is known in it yet."""
+        self.window_origin[None] = ti.Vector([ox, oy, oz])
+        self.window_shape[None] = ti.Vector([nx, ny, nz])
         for i in ti.static(range(2)):
             self.fault[i] = ti.i64(NO_FAULT)
 
+    @ti.kernel
+    def faults(self) -> ti.types.vector(2, ti.i64):
+        return ti.Vector([self.fault[0], self.fault[1]])
+
     def read_fault(self):
         """(too fast, outside of the window): each substep << 32 | particle, or -1."""
-        return tuple(-1 if self.fault[i] == NO_FAULT else self.fault[i] for i in range(2))
+        return tuple(-1 if fault == NO_FAULT else int(fault) for fault in self.faults())
 
     # ---- adjoint -------------------------------------------------------------------------------------------------
     # ``*_bar`` hold the adjoint of the state after substep s; each kernel replaces them by that before it.

@@ -225,7 +225,6 @@ class Recording:
             window = known or sim.window(begin, reckless)
             self.windows[start + begin] = window
             nodes = sim.set_window(window)
-            k.clear_fault()
             self._substeps(start, begin, end, nodes)
             self.logs[end] = self.logs[begin] + (end - begin) * nodes
             too_fast, outside = k.read_fault()
