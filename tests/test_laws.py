@@ -155,13 +155,9 @@ def test_kernels_equal_the_definition(name):
     expected = law.project(f, 1e-3).detach()
     ours = torch.as_tensor(sim.k.deformation_gradient.to_numpy()[0, :64])
     stress = torch.as_tensor(sim.k.kirchhoff_stress.to_numpy()[0, :64])
-    # Taichi's singular value decomposition stops at about 1e-6.
-    tolerance = 1e-4 if name in ("von_mises", "non_newtonian", "drucker_prager") else 1e-9
-    torch.testing.assert_close(ours, expected.expand_as(f).contiguous(), rtol=tolerance, atol=0.01 * tolerance)
+    torch.testing.assert_close(ours, expected.expand_as(f).contiguous(), rtol=1e-9, atol=1e-11)
     scale = float(law.stress(expected.expand_as(f)).detach().abs().max())
-    torch.testing.assert_close(
-        stress, law.stress(expected.expand_as(f)).detach(), rtol=tolerance, atol=tolerance * scale
-    )
+    torch.testing.assert_close(stress, law.stress(expected.expand_as(f)).detach(), rtol=1e-9, atol=1e-9 * scale)
 
 
 def test_von_mises_returns_to_its_yield_surface():
