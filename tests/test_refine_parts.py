@@ -122,9 +122,9 @@ def fits(*levels, count=3):
     return SimpleNamespace(squares=[squares], parameters=[None] * count, values=dict.fromkeys(range(count)))
 
 
-def judged(before, after, sigma=NOISE, adapts=True):
+def judged(before, after, sigma=NOISE, adapts=True, sure=None):
     experiments = [Watched(sigma=np.full(INSTANTS, sigma))]
-    return explains_too_little(before, after, experiments, RefineConfig.model_validate({}), adapts=adapts)
+    return explains_too_little(before, after, experiments, RefineConfig.model_validate({}), adapts=adapts, sure=sure)
 
 
 def test_evidence():
@@ -133,6 +133,11 @@ def test_evidence():
     assert "held-out" in judged(fits(9, 20), fits(6, 22))[0]  # held-out instants contradict
     assert judged(fits(9, 20), fits(2, 20)) == []  # they cannot tell, the fitted ones are plain
     assert "held-out" in judged(fits(9, 20), fits(6, 20))[0]  # not plain enough for that
+    # Plain beside a noise as smooth as what is left; not where held-out instants contradict, nor for next to nothing.
+    assert judged(fits(9, 20), fits(6, 20), sure=7.0) == []
+    assert "held-out" in judged(fits(9, 20), fits(6, 20), sure=5.0)[0]
+    assert "held-out" in judged(fits(9, 20), fits(6, 22), sure=7.0)[0]
+    assert "held-out" in judged(fits(1.9, 20), fits(1, 20), sure=7.0)[-1]
     assert judged(fits(2, 20), fits(1.5, 3)) == []  # they are decisive
     # The less the fitted instants say, the more the held-out ones must: half of what noise could change, a third of 20.
     assert judged(fits(1.6, 20), fits(1.1, 8)) == []

@@ -49,6 +49,10 @@ class RefineConfig(BaseModel):
         description="variance that an effect must explain, over the noise's, in the phase where the simulation is as "
         "certain as the observation, to be accepted although held-out frames are too uncertain to tell",
     )  # fmt: skip
+    plain_sigmas: float = Field(
+        6.0, ge=0,
+        description="sigmas, of a noise as smooth as what is left, from which the noise's own variance is enough there",
+    )  # fmt: skip
     least_bic: float = Field(10.0, ge=0, description="how far an effect must lower the information criterion")
     least_sigmas: float = Field(3.0, ge=0, description="standard errors that a strength must lie from zero")
     confusable: float = Field(0.95, gt=0, le=1, description="correlation from which two effects look alike")

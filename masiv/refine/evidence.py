@@ -9,14 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
+from masiv.refine.certainty import certain_instants, certainty
 from masiv.refine.config import RefineConfig
 from masiv.refine.refit import Fitted
 from masiv.refine.simulated import Term, Watched
 
 SIMPLER = 0.25
 """Variance, over that of noise and grid, that tells nothing."""
-CERTAIN = 1.5
-"""Times the noise that sigma is where the motion is as well simulated as it is observed."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ def phases(ratios: Sequence[np.ndarray], experiments: Sequence[Watched]) -> Phas
     """Of ``ratios`` (K,) of each experiment over its instants."""
     certain, uncertain = [], []
     for ratio, e in zip(ratios, experiments, strict=True):
-        known = e.sigma[: e.rows] < CERTAIN * e.noise
+        known = certain_instants(e)
         certain.append(ratio[: e.rows][known])
         uncertain.append(ratio[: e.rows][~known])
     means = (float(part.mean()) if len(part) else None for part in map(np.concatenate, (certain, uncertain)))
@@ -76,7 +75,8 @@ def objections(
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
     adapts = len(term.parameters) > 1 or gain < 2 * config.least_bic
-    out += explains_too_little(before, after, experiments, config, adapts=adapts)
+    sure = certainty(after, term, experiments)
+    out += explains_too_little(before, after, experiments, config, adapts=adapts, sure=sure)
     sigmas = sigmas_from_zero(after, term)
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
@@ -115,8 +115,9 @@ def sigmas_from_zero(fitted: Fitted, term: Term) -> float:
 
 
 def explains_too_little(
-    before: Fitted, after: Fitted, experiments: Sequence[Watched], config: RefineConfig, *, adapts: bool = True
-) -> list[str]:
+    before: Fitted, after: Fitted, experiments: Sequence[Watched], config: RefineConfig,
+    *, adapts: bool = True, sure: float | None = None,
+) -> list[str]:  # fmt: skip
     """What fitted and held-out instants, weighted alike, say against ``after``.
 
     Three kinds of evidence are enough: a part of the held-out error that is the larger (``least_gain`` to
@@ -138,7 +139,8 @@ def explains_too_little(
     removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
     asked = config.least_gain + (config.decisive_gain - config.least_gain) * (1 - min(max(share, 0.0), 1.0))
     confirmed = share > 0 and won.mean() >= SIMPLER and removed >= asked
-    plain = fitted.certain is not None and fitted.certain >= config.decisive and abs(won.mean()) < 1
+    enough = 1.0 if sure is not None and sure >= config.plain_sigmas else config.decisive
+    plain = fitted.certain is not None and fitted.certain >= enough and abs(won.mean()) < 1
     simple = not adapts and removed >= config.least_gain and share > 0
     if confirmed or plain or simple:
         return []

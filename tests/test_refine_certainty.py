@@ -1,0 +1,92 @@
+"""How certain a cause is, beside noise that is smooth in space and time."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from masiv.identify.parametric import Parameter
+from masiv.identify.smoothness import smoothness
+from masiv.refine.certainty import certainty
+
+INSTANTS, POINTS = 11, 120
+LENGTH, METRES, SIZE = 2.0, 0.12, 2e-3
+PLACES = np.random.default_rng(1).uniform(-0.3, 0.3, size=(POINTS, 3))
+TIMES = np.arange(1.0, INSTANTS + 1)
+
+
+WATCHED = [SimpleNamespace(places=PLACES, rows=INSTANTS, noise=SIZE, sigma=np.full(INSTANTS, SIZE))]
+
+
+def noises(count, seed=0):
+    """``count`` fields (K, N, 3) [m] of noise that is as smooth as it says above."""
+    random = np.random.default_rng(seed)
+    lag = np.subtract.outer(TIMES, TIMES)
+    apart = np.linalg.norm(PLACES[:, None] - PLACES[None], axis=2)
+    time, space = (
+        np.linalg.cholesky(np.exp(-0.5 * (d / length) ** 2) + 1e-6 * np.eye(len(d)))
+        for d, length in ((lag, LENGTH), (apart, METRES))
+    )
+    return [SIZE * np.einsum("kl,nm,lma->kna", time, space, random.normal(size=(INSTANTS, POINTS, 3)))
+            for _ in range(count)]  # fmt: skip
+
+
+def fields_of(*patterns):
+    """(M, P) of fields (K, N, 3)."""
+    return np.stack([np.broadcast_to(p, (INSTANTS, POINTS, 3)).ravel() for p in patterns], axis=1)
+
+
+def launch():
+    """What a fit absorbs: velocity and spin."""
+    moved = [TIMES[:, None, None] * axis for axis in np.eye(3)]
+    return moved + [TIMES[:, None, None] * np.cross(axis, PLACES) for axis in np.eye(3)]
+
+
+SMOOTH = (TIMES**2)[:, None, None] * np.array([0.0, 1e-2, 0.0])
+ROUGH = SMOOTH * np.sign(np.sin(60 * PLACES[:, :1]))
+
+
+def found(noise, pattern, strength):
+    """Least squares of a strength beside the launch, in an observation with ``noise``."""
+    jacobian = fields_of(*launch(), pattern)
+    target = strength * jacobian[:, -1] + noise.ravel()
+    theta = np.linalg.lstsq(jacobian, target, rcond=None)[0]
+    names = [*"abcdef", "pull.strength"]
+    parameters = [Parameter(n, 0.0, -9.0, 9.0, 1e-3) for n in names]
+    fitted = SimpleNamespace(
+        residual=jacobian @ theta - target, jacobian=jacobian, parameters=parameters,
+        values=dict(zip(names, theta, strict=True)),
+    )  # fmt: skip
+    return fitted, SimpleNamespace(strengths=(parameters[-1],), others=())
+
+
+def test_lengths_are_those_of_the_noise_though_a_fit_took_its_smoothest_part():
+    more = [TIMES[:, None, None] ** n * axis for n in (0, 2) for axis in np.eye(3)]
+    jacobian = fields_of(*launch(), *more, *[m * PLACES[:, k, None] for m in more for k in range(3)])
+    lengths = []
+    for noise in noises(8):
+        left = noise.ravel() - jacobian @ np.linalg.lstsq(jacobian, noise.ravel(), rcond=None)[0]
+        assert (left**2).mean() < 0.9 * (noise**2).mean()
+        lengths.append(smoothness(left.reshape(noise.shape), jacobian.reshape(*noise.shape, -1), PLACES))
+    assert np.median([n.instants for n in lengths]) == pytest.approx(LENGTH, rel=0.3)
+    assert np.median([n.metres for n in lengths]) == pytest.approx(METRES, rel=0.35)
+    assert np.median([n.variance for n in lengths]) == pytest.approx(SIZE**2, rel=0.35)
+    few = PLACES[:4]
+    assert smoothness(np.ones((9, 4, 3)), np.zeros((9, 4, 3, 0)), few) is None
+    assert smoothness(np.ones((2, POINTS, 3)), np.zeros((2, POINTS, 3, 0)), PLACES) is None
+
+
+@pytest.mark.parametrize("pattern", [SMOOTH, ROUGH], ids=["smooth", "rough"])
+def test_noise_alone_is_as_certain_as_chance_has_it(pattern):
+    sigmas = [certainty(*found(noise, pattern, 0.0), WATCHED) for noise in noises(60, seed=2)]
+    assert np.mean(np.square(sigmas)) == pytest.approx(1.0, rel=0.6)
+
+
+def test_a_smooth_cause_is_less_certain_than_a_rough_one_of_the_same_size():
+    (noise,) = noises(1, seed=3)
+    smooth, rough = (certainty(*found(noise, p, 0.01), WATCHED) for p in (SMOOTH, ROUGH))
+    assert rough > 3 * smooth
+    assert certainty(*found(noise, SMOOTH, 0.3), WATCHED) > 6
+    assert certainty(*found(noise, 0 * SMOOTH, 0.3), WATCHED) == 0.0
