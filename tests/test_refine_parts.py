@@ -124,7 +124,7 @@ def fits(*levels, count=3):
 
 def judged(before, after, sigma=NOISE, adapts=True, sure=None):
     experiments = [Watched(sigma=np.full(INSTANTS, sigma))]
-    return explains_too_little(before, after, experiments, RefineConfig.model_validate({}), adapts=adapts, sure=sure)
+    return explains_too_little(before, after, experiments, RefineConfig(), adapts=adapts, sure=lambda: sure)
 
 
 def test_evidence():

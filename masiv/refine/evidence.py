@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,8 +75,9 @@ def objections(
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
     adapts = len(term.parameters) > 1 or gain < 2 * config.least_bic
-    sure = certainty(after, term, experiments)
-    out += explains_too_little(before, after, experiments, config, adapts=adapts, sure=sure)
+    out += explains_too_little(
+        before, after, experiments, config, adapts=adapts, sure=lambda: certainty(after, term, experiments)
+    )  # fmt: skip
     sigmas = sigmas_from_zero(after, term)
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
@@ -116,7 +117,7 @@ def sigmas_from_zero(fitted: Fitted, term: Term) -> float:
 
 def explains_too_little(
     before: Fitted, after: Fitted, experiments: Sequence[Watched], config: RefineConfig,
-    *, adapts: bool = True, sure: float | None = None,
+    *, adapts: bool = True, sure: Callable[[], float | None] = lambda: None,
 ) -> list[str]:  # fmt: skip
     """What fitted and held-out instants, weighted alike, say against ``after``.
 
@@ -139,13 +140,23 @@ def explains_too_little(
     removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
     asked = config.least_gain + (config.decisive_gain - config.least_gain) * (1 - min(max(share, 0.0), 1.0))
     confirmed = share > 0 and won.mean() >= SIMPLER and removed >= asked
-    enough = 1.0 if sure is not None and sure >= config.plain_sigmas else config.decisive
-    plain = fitted.certain is not None and fitted.certain >= enough and abs(won.mean()) < 1
     simple = not adapts and removed >= config.least_gain and share > 0
-    if confirmed or plain or simple:
+    if confirmed or simple:
+        return []
+    if fitted.certain is not None and abs(won.mean()) < 1 and _plain(fitted.certain, config, sure):
         return []
     held_out = (
         f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * asked:.0f} %), "
         f"{max(float(won.mean()), 0.0):.2g} of what noise and a finer grid alone could change there"
     )
     return [little] * (share < 1) + [held_out]
+
+
+def _plain(gained: float, config: RefineConfig, sure: Callable[[], float | None]) -> bool:
+    """Whether the variance that is ``gained`` in free flight, over the noise's, is enough where held-out instants
+    cannot tell; less is where noise as smooth as what is left does not look like the cause (``sure``, which takes
+    seconds)."""
+    if gained >= config.decisive or gained < 1:
+        return gained >= config.decisive
+    sigmas = sure()
+    return sigmas is not None and sigmas >= config.plain_sigmas
