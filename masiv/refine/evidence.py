@@ -132,12 +132,10 @@ def explains_too_little(
     fitted = phases(gained, experiments)
     share = fitted.largest
     little = f"it explains {max(share, 0.0):.2g} of what noise and a finer grid alone could change"
-    rest = [k for k, e in enumerate(experiments) if e.holds_out]
-    if not rest:
+    was, now = held_out(before, experiments), held_out(after, experiments)
+    if not len(was):
         return [] if share >= 1 else [little]
-    won = np.concatenate([gained[k][experiments[k].rows :] for k in rest])
-    old = np.concatenate([(before.squares[k] / experiments[k].sigma ** 2)[experiments[k].rows :] for k in rest])
-    removed = 1 - math.sqrt(max(1 - float(won.sum()) / max(float(old.sum()), 1e-300), 0.0))
+    won, removed = was - now, removed_of(was, now)
     asked = config.least_gain + (config.decisive_gain - config.least_gain) * (1 - min(max(share, 0.0), 1.0))
     confirmed = share > 0 and won.mean() >= SIMPLER and removed >= asked
     simple = not adapts and removed >= config.least_gain and share > 0
@@ -145,11 +143,24 @@ def explains_too_little(
         return []
     if fitted.certain is not None and abs(won.mean()) < 1 and _plain(fitted.certain, config, sure):
         return []
-    held_out = (
+    there = (
         f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * asked:.0f} %), "
         f"{max(float(won.mean()), 0.0):.2g} of what noise and a finer grid alone could change there"
     )
-    return [little] * (share < 1) + [held_out]
+    return [little] * (share < 1) + [there]
+
+
+def held_out(fitted: Fitted, experiments: Sequence[Watched]) -> np.ndarray:
+    """Squares over those of noise and grid at the held-out instants of all ``experiments``."""
+    parts = [
+        (squares / e.sigma**2)[e.rows :] for squares, e in zip(fitted.squares, experiments, strict=True) if e.holds_out
+    ]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def removed_of(was: np.ndarray, now: np.ndarray) -> float:
+    """Share of a root mean square that is gone, of squares before and after."""
+    return 1 - math.sqrt(float(now.sum()) / max(float(was.sum()), 1e-300))
 
 
 def _plain(gained: float, config: RefineConfig, sure: Callable[[], float | None]) -> bool:

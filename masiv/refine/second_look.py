@@ -8,17 +8,15 @@ noise only a cause of one number is looked for, which cannot adapt to an error o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
-import numpy as np
+from collections.abc import Callable
 
 from masiv.refine.add_effect import refit
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import beyond_possible, sigmas_from_zero
+from masiv.refine.evidence import beyond_possible, held_out, removed_of, sigmas_from_zero
 from masiv.refine.refit import Fitted, carried
 from masiv.refine.rounds import Round, Trial, confusable
 from masiv.refine.score import Candidate
-from masiv.refine.simulated import Simulated, Watched
+from masiv.refine.simulated import Simulated
 from masiv.refine.tasks import ranked, side_by_side
 from masiv.workers import Failed, Workers
 
@@ -104,18 +102,10 @@ def objections(simulation: Simulated, before: Fitted, after: Fitted, config: Ref
     was, now = (held_out(f, simulation.experiments) for f in (before, after))
     clear = gain >= 2 * config.least_bic
     if len(was):
-        removed = 1 - float(np.sqrt(now.sum() / max(was.sum(), 1e-300)))
+        removed = removed_of(was, now)
         asked = config.least_gain * (1 if clear else 2)
         if removed < asked:
             out.append(f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * asked:.0f} %)")
     elif not clear:
         out.append(f"the information criterion falls by {gain:.1f}, less than {2 * config.least_bic:g}")
     return out
-
-
-def held_out(fitted: Fitted, experiments: Sequence[Watched]) -> np.ndarray:
-    """Squares over those of noise and grid at the held-out instants of all ``experiments``."""
-    parts = [
-        (squares / e.sigma**2)[e.rows :] for squares, e in zip(fitted.squares, experiments, strict=True) if e.holds_out
-    ]
-    return np.concatenate(parts) if parts else np.zeros(0)
