@@ -72,7 +72,8 @@ def test_as_many_as_asked_or_as_there_are_cores():
     assert 1 <= processes_wanted(0) <= 4
 
 
-def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
+def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
+    monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
     motion = observed({"linear_drag": [1.0]})
     first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
     config = RefineConfig(particles=200, samples_per_frame=1)
@@ -85,7 +86,7 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
     values |= {f"velocity_{a}@run": v for a, v in zip("xyz", VELOCITY, strict=True)}
     values |= {f"omega_{a}@run": v for a, v in zip("xyz", OMEGA, strict=True)}
     simulation.settle(model, values)
-    names = ["linear_drag", "gravity_scale", "body_force", "viscosity"]
+    names = ["linear_drag", "gravity_scale"]
     found = []
     for workers in (Workers(1), two):
         before = simulation.rollouts
@@ -93,7 +94,7 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
         ranking = ranked(workers, simulation, base, soft=1.0, names=names, progress=quiet)
         found.append((base, ranking, simulation.rollouts - before))
     (base, ranking, count), (other_base, other, other_count) = found
-    assert count == other_count == len(base.parameters) + 2 + 6
+    assert count == other_count == len(base.parameters) + 2 + len(names)
     np.testing.assert_array_equal(base.jacobian, other_base.jacobian)
     assert [c.effect for c in ranking] == [c.effect for c in other]
     assert ranking[0].effect == "linear_drag"
