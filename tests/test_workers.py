@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import numpy as np
 import pytest
 from test_refine import FITTED, OMEGA, VELOCITY, observed, scene
 
 from masiv import runtime
+from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
+from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.families import FAMILIES
 from masiv.mpm.config import SimulatorConfig
-from masiv.refine.baselines import derived
+from masiv.refine.baselines import DONE, baselines, derived
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model, Simulation, parameters
 from masiv.refine.observed import SampledMotion
@@ -72,15 +75,34 @@ def test_as_many_as_asked_or_as_there_are_cores():
     assert 1 <= processes_wanted(0) <= 4
 
 
-def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
-    monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
+def small_simulation():
     motion = observed({"linear_drag": [1.0]})
     first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
-    config = RefineConfig(particles=200, samples_per_frame=1)
+    config = RefineConfig(particles=200, samples_per_frame=1, laws=["neo_hookean"])
     experiment, *_ = experiment_of(
         "run", scene(), first, motion, IdentifyConfig(contact="sticky"), SimulatorConfig(), config, seed=0
     )
-    simulation = Simulation([experiment])
+    return Simulation([experiment]), config
+
+
+def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
+    simulation, config = small_simulation()
+    law = {"youngs_modulus": 2.5e4, "poissons_ratio": 0.31}
+    throw = {
+        f"{n}_{a}": v for n, vs in (("velocity", VELOCITY), ("omega", OMEGA)) for a, v in zip("xyz", vs, strict=True)
+    }
+    checkpoint = Checkpoint(tmp_path / "refine.pt")
+    done = FamilyFit("neo_hookean", "sticky", {**law, **throw, "ground_offset": 0.0}, stage=DONE)
+    checkpoint.save({"neo_hookean": done.state()})
+    unused: Any = None
+    (fitted,) = baselines(simulation, unused, unused, 1, config, checkpoint, quiet)
+    assert {n: fitted.values[n] for n in law} == law
+    assert fitted.model.contact == "sticky"
+
+
+def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
+    monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
+    simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
     values = {p.name: p.start for p in parameters(model, simulation.experiments)}
     values |= {f"velocity_{a}@run": v for a, v in zip("xyz", VELOCITY, strict=True)}

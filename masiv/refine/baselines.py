@@ -19,6 +19,8 @@ from masiv.refine.tasks import demanded, side_by_side
 from masiv.workers import Failed, Workers
 
 SHORT, HALF = 1 / 3, 1 / 2
+DONE = 2
+"""``FamilyFit.stage`` of a fit to all frames."""
 
 
 def baselines(
@@ -43,15 +45,15 @@ def baselines(
     progress("refine: laws without effects", 0, len(kinds), ", ".join(kinds))
     if len(kinds) > config.families:
         found = workers.map(_fitted, [(kind, fewer, motion, first_frames, SHORT) for kind in kinds])
-        short = list(_known(kinds, found, progress))
+        short = _some(list(_known(kinds, found, progress)))
         kinds = [f.kind for f in ranked(short)[: config.families]]
-    saved = {kind: FamilyFit(**state) for kind, state in (checkpoint.load() or {}).items()}
+    saved = {kind: FamilyFit(**state) for kind, state in (checkpoint.load() or {}).items() if state["stage"] >= DONE}
     missing = [kind for kind in kinds if kind not in saved]
     found = workers.map(_fitted, [(kind, few, motion, first_frames, HALF) for kind in missing])
-    for fit in _known(missing, found, progress) if missing else ():
+    for fit in _known(missing, found, progress):
         saved[fit.kind] = fit
         checkpoint.save({kind: fit.state() for kind, fit in saved.items()})
-    models = [_carried(simulation, saved[kind]) for kind in kinds if kind in saved]
+    models = [_carried(simulation, saved[kind]) for kind in _some([kind for kind in kinds if kind in saved])]
     fits = side_by_side(workers, simulation, derived, [(*m, config.baseline_rollouts) for m in models])
     return [demanded(fitted) for fitted in fits]
 
@@ -61,16 +63,19 @@ def _fitted(kind: str, problem: Problem, motion: Motion, first_frames: int, shar
 
 
 def _known(kinds: Sequence[str], found: Iterable[FamilyFit | Failed], progress: Progress) -> Iterator[FamilyFit]:
-    """Those that explain the motion. Raises MasivError where none does."""
-    any_of_them = False
+    """Those that explain the motion."""
     for done, (kind, fit) in enumerate(zip(kinds, found, strict=True)):
         note = fit.reason if isinstance(fit, Failed) else f"{1e3 * fit.error_m:.1f} mm"
         progress("refine: laws without effects", done + 1, len(kinds), f"{kind}: {note}")
         if not isinstance(fit, Failed):
-            any_of_them = True
             yield fit
-    if not any_of_them:
+
+
+def _some(found: list) -> list:
+    """``found``, if there is any. Raises MasivError."""
+    if not found:
         raise MasivError("refine: no classical law explains the motion; look at its trajectory in the report")
+    return found
 
 
 def _carried(simulation: Simulation, found: FamilyFit) -> tuple[Model, dict[str, float]]:

@@ -51,12 +51,8 @@ def close_loop(
     weigh(simulation, least, observation)
     soft = max(softness(simulation.residual(least.model, least.values)), SOFT * simulation.experiments[0].noise)
     say("refine: weigh", 0, 1, "")
-    rivals = ordered(
-        [
-            demanded(f)
-            for f in side_by_side(workers, simulation, reweighted, [(b, CHORD_STEPS, soft) for b in baselines])
-        ]
-    )[: config.families]
+    again = side_by_side(workers, simulation, reweighted, [(base, CHORD_STEPS, soft) for base in baselines])
+    rivals = ordered([demanded(fitted) for fitted in again])[: config.families]
     say("refine: weigh", 1, 1, "")
     before = current = rivals[0]
     rounds: list[Round] = []
