@@ -1,7 +1,7 @@
 """Simulations side by side: processes that each have a Taichi of their own, on one thread.
 
 A rollout of a few thousand particles gains little from a second thread, and two rollouts in two processes take as
-long as one. What a task gives is the same to the bit, wherever it runs.
+long as one. A rollout is the same to the bit, wherever it runs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from masiv import runtime
-from masiv.errors import MasivError
+from masiv.errors import InputError, MasivError
 
 ONE_THREAD = {
     "TI_CPU_MAX_NUM_THREADS": "1",
@@ -31,10 +31,11 @@ def processes_wanted(asked: int) -> int:
 
 
 class Failed:
-    """What a task that raised a MasivError gives."""
+    """What a task that raised a MasivError gives: what it said, and whether the input was to blame."""
 
-    def __init__(self, reason: str) -> None:
-        self.reason = reason
+    def __init__(self, failed: MasivError) -> None:
+        self.reason = str(failed)
+        self.kind = InputError if isinstance(failed, InputError) else MasivError
 
 
 class Workers:
@@ -121,4 +122,4 @@ def attempt(function: Callable, task: tuple) -> Any:
     try:
         return function(*task)
     except MasivError as failed:
-        return Failed(str(failed))
+        return Failed(failed)

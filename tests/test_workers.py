@@ -11,7 +11,7 @@ from test_refine import FITTED, OMEGA, VELOCITY, observed, scene
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
-from masiv.errors import MasivError
+from masiv.errors import InputError, MasivError
 from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.families import FAMILIES
@@ -21,7 +21,7 @@ from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model, Simulation, parameters
 from masiv.refine.observed import SampledMotion
 from masiv.refine.prepare import experiment_of
-from masiv.refine.tasks import ranked, side_by_side
+from masiv.refine.tasks import demanded, ranked, side_by_side
 from masiv.workers import Failed, Workers, processes_wanted
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -37,6 +37,10 @@ def halved(number):
     if number % 2:
         raise MasivError(f"{number} is odd")
     return number // 2, os.getpid()
+
+
+def blamed():
+    raise InputError("no such effect")
 
 
 def dies():
@@ -57,6 +61,12 @@ def test_results_come_in_order_and_a_failure_is_one_of_them(two):
     assert [f.reason for f in found[1::2]] == [f"{k} is odd" for k in (1, 3, 5, 7, 9)]
     assert os.getpid() not in {f[1] for f in found[::2]}
     assert all(isinstance(f, Failed) for f in Workers(1).map(halved, [(1,), (3,)]))
+
+
+def test_bad_input_stays_bad_input(two):
+    for found in two.map(blamed, [(), ()]):
+        with pytest.raises(InputError, match="no such effect"):
+            demanded(found)
 
 
 def test_each_process_runs_on_one_thread_and_this_one_as_before(two):

@@ -47,7 +47,7 @@ def smoothness(field: np.ndarray, sensitivities: np.ndarray, positions: np.ndarr
     if size == 0.0:
         return None
     some = field[:, few]
-    basis = _basis(sensitivities[:, few].reshape(some.size, -1))
+    basis = basis_of(sensitivities[:, few].reshape(some.size, -1))
     # The same fit, to these instants and points alone, so that what it left of them is known exactly.
     left = some.ravel() - basis @ (basis.T @ some.ravel())
     shaped = basis.reshape(*some.shape, -1)
@@ -103,7 +103,7 @@ def _grams(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return in_time, a @ b.T
 
 
-def _basis(a: np.ndarray) -> np.ndarray:
+def basis_of(a: np.ndarray) -> np.ndarray:
     """Orthonormal columns that span those of ``a`` (M, P)."""
     lengths = np.linalg.norm(a, axis=0)
     seen = lengths > 1e-9 * lengths.max(initial=0.0)

@@ -123,7 +123,8 @@ def explains_too_little(
 
     Three kinds of evidence are enough: a part of the held-out error that is the larger (``least_gain`` to
     ``decisive_gain``) the less is explained of what noise and grid could change in the fitted instants; held-out
-    instants that cannot tell, and a motion that is plain where the simulation is as certain as the observation; or
+    instants that cannot tell, and a motion that is plain where the simulation is as certain as the observation (sure:
+    how many sigmas the effect is from none beside a smooth noise, worked out where that decides); or
     ``least_gain`` of the held-out error, for an effect that cannot adapt to an error of any shape (``adapts`` False: it
     is one number, and the criterion is clear).
     """

@@ -15,6 +15,7 @@ import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.identify.parametric import robust_weight
+from masiv.identify.smoothness import basis_of
 from masiv.refine.refit import Fitted, free_parameters, robust_cost
 from masiv.refine.simulated import Simulated, Term
 
@@ -62,7 +63,7 @@ def score(
     weighted = base.jacobian * weight[:, None]
     # What is held at a bound that the descent would cross absorbs nothing more.
     free = free_parameters(base.parameters, base.values, -weighted.T @ (base.residual * weight))
-    nuisance = _basis(weighted[:, free])
+    nuisance = basis_of(weighted[:, free])
     left = _without(nuisance, base.residual * weight)
     found, lost = [], simulation.lost(base)
     todo = [n for n in (names or simulation.candidates(base.model)) if n not in base.model.effects]
@@ -185,13 +186,6 @@ def _within_bounds(s: np.ndarray, left: np.ndarray, strengths) -> tuple[np.ndarr
     q, r = np.linalg.qr(s * scale)
     theta = lsq_linear(r, -(q.T @ left), (lower, upper)).x * scale
     return theta, s @ theta
-
-
-def _basis(a: np.ndarray) -> np.ndarray:
-    """Orthonormal columns that span those of ``a`` (M, P)."""
-    lengths = np.linalg.norm(a, axis=0)
-    u, s, _ = np.linalg.svd(a[:, lengths > 0] / lengths[lengths > 0], full_matrices=False)
-    return u[:, s > 1e-6 * s[0]] if len(s) else u
 
 
 def _without(basis: np.ndarray, a: np.ndarray) -> np.ndarray:

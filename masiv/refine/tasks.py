@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-from masiv.errors import MasivError
 from masiv.refine.refit import Fitted
 from masiv.refine.score import Candidate, score
 from masiv.refine.simulated import Simulated
@@ -29,9 +28,9 @@ def _counted(function: Callable, simulation: Simulated, *task: Any) -> tuple[Any
 
 
 def demanded(found: Any) -> Any:
-    """``found``, unless it is ``Failed``. Raises MasivError."""
+    """``found``, unless it is ``Failed``. Raises MasivError, InputError where the input was to blame."""
     if isinstance(found, Failed):
-        raise MasivError(found.reason)
+        raise found.kind(found.reason)
     return found
 
 
