@@ -1,6 +1,6 @@
 """Which effect does refine name? Simulated throws with undeclared effects, as tracks with correlated noise.
 
-    python benchmarks/refine_tracks.py --out FILE.jsonl [--only NAME] [--particles 1500]
+    python benchmarks/refine_tracks.py --out FILE.jsonl [--only NAME] [--particles 1500] [--set KEY=VALUE …]
 
 One JSON line a case; cases already in FILE are skipped, so that a stopped run goes on. ``--table FILE`` prints the
 confusion table.
@@ -11,6 +11,8 @@ import json
 import sys
 import time
 from pathlib import Path
+
+import yaml
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -72,7 +74,7 @@ def cases():
     return sorted(out, key=lambda case: case.law != "neo_hookean" or case.name.endswith("_stiff"))
 
 
-def refined(case, particles, laws, with_oracle):
+def refined(case, config, with_oracle):
     import torch
     from oracle import oracle
     from track_cases import observed
@@ -81,7 +83,6 @@ def refined(case, particles, laws, with_oracle):
     from masiv.identify.config import IdentifyConfig
     from masiv.mpm.config import SimulatorConfig
     from masiv.refine.baselines import baselines
-    from masiv.refine.config import RefineConfig
     from masiv.refine.evidence import excess
     from masiv.refine.loop import close_loop
     from masiv.refine.model import Simulation
@@ -92,7 +93,6 @@ def refined(case, particles, laws, with_oracle):
 
     torch.set_num_threads(1)
     scene, motion = observed(case)
-    config = RefineConfig.model_validate({"particles": particles, "laws": laws})
     whole = SampledMotion(motion.positions, motion.times, motion.volume)
     cut = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
     experiment, few, fewer, launch = experiment_of(
@@ -161,6 +161,7 @@ def main():
     parser.add_argument("--only", default="")
     parser.add_argument("--particles", type=int, default=1500)
     parser.add_argument("--laws", default="", help="families that compete, with commas; the case's own where empty")
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of refine")
     parser.add_argument("--no-oracle", action="store_true", help="do not fit a model that was told the effect")
     parser.add_argument("--table")
     options = parser.parse_args()
@@ -168,6 +169,7 @@ def main():
         table(options.table)
         return
     from masiv import runtime
+    from masiv.refine.config import RefineConfig
 
     runtime.start("cpu")
     out = Path(options.out)
@@ -176,7 +178,9 @@ def main():
         if case.name in done or (options.only and options.only not in case.name):
             continue
         laws = [n for n in options.laws.split(",") if n] or [case.law]
-        row = refined(case, options.particles, laws, not options.no_oracle)
+        settings = {"particles": options.particles, "laws": laws}
+        settings |= {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in options.set)}
+        row = refined(case, RefineConfig.model_validate(settings), not options.no_oracle)
         with out.open("a") as file:
             file.write(json.dumps(row) + "\n")
         print(case.name, "->", row["accepted"], [round(x) for x in row["seconds"]], flush=True)

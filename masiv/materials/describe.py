@@ -110,7 +110,7 @@ def describe_twin(
     from masiv.mpm.simulate import march, simulate
 
     chosen = np.linspace(0, len(twin.positions) - 1, min(particles, len(twin.positions))).round().astype(int)
-    few = replace(twin, positions=twin.positions[chosen])
+    few = replace(twin, positions=twin.positions[chosen], simulator=twin.simulator.model_copy(update={"split": 1}))
     done = 0
 
     def reroll(law: Law) -> np.ndarray:

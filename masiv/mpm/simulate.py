@@ -19,6 +19,7 @@ from masiv.errors import InputError
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import at_rest
 from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.split import finer
 from masiv.mpm.twin_effects import active_effects, lowered, mass_ratio
 from masiv.mpm.variation import without_effects
 from masiv.progress import Progress, silent
@@ -93,7 +94,7 @@ def simulate(
     substeps: int | None = None,
     progress: Progress = silent,
 ) -> Motion:
-    """The first ``frames`` frames of the twin's motion, frame 0 included.
+    """The first ``frames`` frames of the twin's motion, frame 0 included, its particles in ``simulator.split`` parts.
 
     velocity (3,) [m/s], omega (3,) [rad/s], gravity (3,) [m/s^2], world frame, replace what was identified; fps the
     video's. push: a force for a while. without: names of effects of the twin that are not to act. substeps: in a frame;
@@ -109,7 +110,7 @@ def simulate(
     rate = twin.fps if fps is None else fps
     if push is not None and push.start >= (frames - 1) / rate:
         raise InputError(f"--force-from {push.start:g}: the last frame is at {(frames - 1) / rate:.3g} s")
-    twin = without_effects(twin, without)
+    twin = finer(without_effects(twin, without))
     changes = _vectors(velocity=velocity, omega=omega, gravity=gravity)
     effects = active_effects(twin, frames=frames, fps=rate, gravity=changes.get("gravity"))
     # Frame k is taken at the instant k + late, a share (0, 1] into an interval between two whole frames.

@@ -10,6 +10,7 @@ import numpy as np
 
 from masiv import metrics
 from masiv.errors import InputError
+from masiv.mpm.split import wholes
 from masiv.report.draw import draw, on_black
 from masiv.scene.scene import Ground, Scene
 from masiv.splat.gaussians import Gaussians
@@ -69,11 +70,13 @@ def picture_numbers(
 
 
 def agreement(rollout: np.ndarray, trajectory: np.ndarray) -> dict[str, Any]:
-    """RMSE [mm] between the twin's particles and the estimated ones, (T, Q, 3) both, over frames 1…T−1."""
+    """RMSE [mm] between the twin's particles (T, Q parts, 3) and the estimated ones (T, Q, 3), over frames 1…T−1.
+
+    Raises InputError where the former are not parts of the latter.
+    """
     frames = min(len(rollout), len(trajectory))
-    if rollout.shape[1:] != trajectory.shape[1:]:
-        raise InputError(f"rollout {rollout.shape} and trajectory {trajectory.shape} are of different particles")
-    squared = ((rollout[:frames].astype(np.float64) - trajectory[:frames]) ** 2).sum(-1).mean(-1)
+    simulated = wholes(rollout[:frames].astype(np.float64), trajectory.shape[1])
+    squared = ((simulated - trajectory[:frames]) ** 2).sum(-1).mean(-1)
     return {
         "frames": list(range(1, frames)),
         "trajectory_rmse_mm": float(1e3 * np.sqrt(squared[1:].mean())),

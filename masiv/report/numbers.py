@@ -67,7 +67,7 @@ def run_numbers(
         "twin": twin_numbers(run, scene, dynamic, rollout),
         "fit": measure.agreement(rollout, trajectory.positions),
         "trajectory": {
-            "particles": int(rollout.shape[1]),
+            "particles": int(trajectory.positions.shape[1]),
             "spacing_m": float(trajectory.spacing),
             "volume_m3": float(trajectory.volume),
         },
