@@ -5,9 +5,10 @@
     python benchmarks/identification.py OUT --scenes SCENE --unseen OTHER_SCENE …      laws of SCENE on other throws
     python benchmarks/identification.py OUT --table                                    what is there, as Markdown
 
-Law ``true`` is the family that made the scene. A scene is reconstructed once a seed and fitted with each law from the
-same trajectories. A case whose line is in OUT/results.jsonl is not run again; one that was killed goes on where it was.
-The truth is read after the fit.
+Law ``true`` is the family that made the scene; ``told`` is not fitted at all: that family with its true parameters and
+the true throw, in the body that was reconstructed, which is what fits could reach in this simulator. A scene is
+reconstructed once a seed and fitted with each law from the same trajectories. A case whose line is in OUT/results.jsonl
+is not run again; one that was killed goes on where it was. The truth is read after the fit.
 """
 
 from __future__ import annotations
@@ -29,9 +30,12 @@ from identification_table import tables
 from parameters import FAMILY, true_parameters
 
 from masiv.cli import stages
+from masiv.continuum.trajectory import Trajectory
 from masiv.identify.launch import estimate_launch
 from masiv.identify.stage import identify
+from masiv.materials.classical import ClassicalLaw
 from masiv.metrics import chamfer_floor
+from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing
 from masiv.mpm.simulate import simulate
 from masiv.report.measure import motion_numbers, read_truth
@@ -107,14 +111,17 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
         record = yaml.safe_load((base / "run.yaml").read_text(encoding="utf-8"))
         record["stages"]["identify"] = {"state": "pending"}
         (folder / "run.yaml").write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
+    family = FAMILY[truth_of(case.scene)["material"]["type"]]
     run, settings, scene = stages.open_run(
         case.scene, folder, preset=preset, config=overrides(case.settings, out / "config.yaml"), seed=case.seed,
-        fit_frames=fit_frames, law=FAMILY[material(case.scene)["type"]] if case.law == "true" else case.law,
+        fit_frames=fit_frames, law=family if case.law in ("true", "told") else case.law,
         geometry_loss=case.geometry_loss, silhouette_weight=None if case.silhouette else 0.0,
     )  # fmt: skip
     stages.start(settings)
     trajectory = stages.load_trajectory(run)
-    if not run.done("identify"):
+    if case.law == "told":
+        told(case.scene, scene, trajectory, settings.simulator).save(run.path)
+    elif not run.done("identify"):
         with run.stage("identify") as checkpoint:
             identify(
                 stages.fitted_scene(run, scene), trajectory, settings.identify, settings.simulator,
@@ -125,16 +132,28 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
     return measured(case, run, scene, twin, trajectory.positions, rollout)
 
 
-def material(scene: Path) -> dict[str, Any]:
-    """What made the scene: for the table, and for the name of the family that law ``true`` stands for."""
-    return yaml.safe_load((scene / "truth.yaml").read_text(encoding="utf-8"))["material"]
+def truth_of(scene: Path) -> dict[str, Any]:
+    """What made the scene: for the table, for law ``told``, and for the name of the family that ``true`` stands for."""
+    return yaml.safe_load((scene / "truth.yaml").read_text(encoding="utf-8"))
+
+
+def told(folder: Path, scene: Scene, trajectory: Trajectory, simulator: SimulatorConfig) -> Twin:
+    """The reconstructed body with the throw, ground and law of truth.yaml."""
+    truth = truth_of(folder)
+    return Twin(
+        positions=trajectory.positions[0], velocity=np.array(truth["initial_velocity"], float),
+        omega=np.array(truth["initial_omega"], float), gravity=scene.gravity, ground=scene.ground,
+        contact=truth["floor"]["mode"], friction=0.0, volume=trajectory.volume, density=scene.density, up=scene.up,
+        fps=scene.fps, law=ClassicalLaw(FAMILY[truth["material"]["type"]], **true_parameters(truth["material"])),
+        simulator=simulator, fit={"trajectory_error_mm": None},
+    )  # fmt: skip
 
 
 def measured(
     case: Case, run: RunFolder, scene: Scene, twin: Twin, trajectory: np.ndarray, rollout: np.ndarray
 ) -> dict[str, Any]:
     """The line of a finished case. The truth is read here, after every fit."""
-    truth, points = material(case.scene), read_truth(case.scene / "gt", scene.frame_count)
+    truth, points = truth_of(case.scene)["material"], read_truth(case.scene / "gt", scene.frame_count)
     law = twin.law.description()
     expected = true_parameters(truth) if law["kind"] == FAMILY[truth["type"]] else {}
     splits = {"observed": range(run.fit_frames), "future": range(run.fit_frames, scene.frame_count)}

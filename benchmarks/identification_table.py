@@ -33,11 +33,11 @@ def fit_table(rows: list[Mapping[str, Any]]) -> str:
             both(row, "psnr_box_db", ".1f"),
             both(row, "ssim_box", ".3f"),
             both(row, "psnr_box_in_scene_db", ".1f"),
-            f"{row['seconds']['identify']:.0f}",
+            f"{row['seconds'].get('identify', 0):.0f}",
         ]
         law = row["fitted"] if row["law"] == "true" else row["law"]
-        if row["law"] == "auto":
-            law = f"auto: {row['fitted']}"
+        if row["law"] in ("auto", "told"):
+            law = f"{row['law']}: {row['fitted']}"
         lines.append(f"| {row['scene']} | {', '.join([law, *variant(row)])} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -59,7 +59,7 @@ def both(row: Mapping[str, Any], name: str, form: str) -> str:
 def parameter_table(rows: list[Mapping[str, Any]]) -> str:
     """Recovered beside true, of fits whose family is the one that made the scene."""
     lines = []
-    for row in rows:
+    for row in (r for r in rows if r["law"] != "told"):
         for name, entry in row["parameters"].items():
             if entry.get("true") is None:
                 continue

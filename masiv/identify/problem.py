@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,6 +105,13 @@ class Problem:
         other.config = self.config.model_copy(update={"geometry_loss": "surface", "iterations": iterations})
         other.surface = torch.from_numpy(np.flatnonzero(surface_points(self.start.numpy())))
         return other
+
+    @functools.cached_property
+    def blob_size(self) -> float:
+        """See ``masiv.identify.silhouette.blob_size``; [m]."""
+        from masiv.identify.silhouette import blob_size
+
+        return blob_size(self)
 
     def substeps(self, law: Law) -> int:
         """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number."""
