@@ -10,7 +10,7 @@ from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen, settings 
 
 from masiv.checkpoint import Checkpoint
 from masiv.identify import polish
-from masiv.identify.fit import Fit
+from masiv.identify.fit import Fit, _objective
 from masiv.identify.problem import Motion, Problem
 from masiv.identify.silhouette import some_of_each
 from masiv.identify.stage import identify
@@ -45,7 +45,7 @@ def filmed(seen):  # noqa: F811
 
 
 def problem_of(filmed, seen, **changes):  # noqa: F811
-    config = settings(silhouette_pictures=1, iterations=16, **changes)
+    config = settings(silhouette_pictures=4, iterations=16, **changes)
     return Problem(filmed, seen[0], config, SimulatorConfig())
 
 
@@ -72,6 +72,17 @@ def test_surfaces_correct_what_paths_had_wrong_and_silhouettes_refuse_what_they_
     kept, report = polished(problem, right)
     assert kept is right
     assert report["silhouette_error_of_surfaces"] > report["silhouette_error_of_paths"]
+
+
+def test_a_fit_keeps_what_its_whole_objective_likes_best(filmed, seen):  # noqa: F811
+    """Paths that have drifted by 3 cm, and silhouettes that have not: the weight between them decides."""
+    true, drift = torch.as_tensor(seen[1]), torch.tensor([0.03, 0.0, 0.0])
+    for weight, prefers_true in ((0.01, False), (10.0, True)):
+        problem = problem_of(filmed, seen, silhouette_weight=weight, samples_per_frame=1)
+        here = problem.axes.points_to_simulation(true[1 : problem.frames + 1].double().numpy())
+        here = torch.as_tensor(here, dtype=torch.float32)
+        problem.targets = here + drift
+        assert (_objective(problem, here) < _objective(problem, here + drift)) == prefers_true
 
 
 def test_surfaces_have_the_last_word_only_where_silhouettes_can_judge(filmed, seen):  # noqa: F811

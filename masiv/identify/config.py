@@ -47,7 +47,8 @@ class IdentifyConfig(BaseModel):
         description="after a fit to paths, half as many iterations on surfaces, kept where the silhouettes are nearer",
     )
     trajectory_weight: float = Field(1.0, ge=0, description="of geometry_loss")
-    silhouette_weight: float = Field(0.2, ge=0)
+    silhouette_weight: float = Field(0.2, ge=0, description="of the silhouettes, while paths lead")
+    polish_silhouette_weight: float = Field(1.0, ge=0, description="of the silhouettes, after the paths")
     prior_weight: float = Field(
         1e-2, ge=0,
         description="of the mean square by which a neural law's log moduli and log rates leave those it started with, "

@@ -13,7 +13,7 @@ import torch
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.problem import Motion, Problem
-from masiv.identify.silhouette import discrepancy, silhouette_errors
+from masiv.identify.silhouette import silhouette_errors, some_of_each
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
@@ -25,13 +25,13 @@ RECOVERY = 1.4
 
 @dataclass
 class Fit:
-    """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; discrepancy: what
-    the fit is chosen by; history: (iteration, frames, trajectory error [m], silhouette error)."""
+    """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; objective: what was
+    made small, there; history: (iteration, frames, trajectory error [m], silhouette error)."""
 
     law: NeuralLaw | AdapterLaw
     motion: Motion
     error_m: float = math.inf
-    discrepancy: float = math.inf
+    objective: float = math.inf
     history: list[tuple[int, int, float, float]] = field(default_factory=list)
 
 
@@ -115,7 +115,7 @@ def fit(
         with torch.no_grad():
             motion.ground_offset.clamp_(-config.ground_range, config.ground_range)
         progress("identify: fit", i + 1, config.iterations, f"{1e3 * best.history[-1][2]:.1f} mm over {frames} frames")
-    if math.isinf(best.discrepancy):  # no step reached the last frame
+    if math.isinf(best.objective):  # no step reached the last frame
         with torch.no_grad():
             for parameter, value in zip(parameters, accepted, strict=True):
                 parameter.copy_(value)
@@ -125,11 +125,22 @@ def fit(
 
 def _keep_better(best: Fit, problem: Problem, positions: torch.Tensor, law: NeuralLaw | AdapterLaw, motion: Motion):
     """Put law and throw into ``best`` where their ``positions`` over all frames are nearer to what was observed."""
-    here = discrepancy(problem, positions)
-    if here < best.discrepancy:
-        best.discrepancy, best.error_m = here, float(problem.error(positions.detach()))
+    here = _objective(problem, positions)
+    if here < best.objective:
+        best.objective, best.error_m = here, float(problem.error(positions.detach()))
         best.law = copy.deepcopy(law)
         best.motion = Motion(*(t.detach().clone() for t in motion.tensors()))
+
+
+@torch.no_grad()
+def _objective(problem: Problem, positions: torch.Tensor) -> float:
+    """What is made small, at ``positions`` over all frames, with the same pictures each time."""
+    config = problem.config
+    value = config.trajectory_weight * problem.geometry_error(positions) / problem.size
+    if problem.scene.views and config.silhouette_pictures and config.silhouette_weight:
+        shown = some_of_each(problem, problem.frames)
+        value = value + config.silhouette_weight * silhouette_errors(problem, positions, shown)
+    return float(value)
 
 
 def _horizon(iteration: int, iterations: int, first: int, last: int) -> int:
@@ -156,7 +167,7 @@ def fit_state(found: Fit) -> dict:
         "law": found.law.state_dict(),
         "motion": list(found.motion.tensors()),
         "error_m": found.error_m,
-        "discrepancy": found.discrepancy,
+        "objective": found.objective,
         "history": found.history,
     }
 
@@ -165,7 +176,7 @@ def fit_from(state: dict, law: NeuralLaw | AdapterLaw) -> Fit:
     """The fit of ``state``; ``law``, of its kind and width, becomes its law."""
     law.load_state_dict(state["law"])
     rows = [tuple(row) for row in state["history"]]
-    return Fit(law, Motion(*state["motion"]), state["error_m"], state["discrepancy"], rows)
+    return Fit(law, Motion(*state["motion"]), state["error_m"], state["objective"], rows)
 
 
 def _state(iteration, caution, failures, reach, parameters, optimiser, best: Fit) -> dict:
@@ -186,7 +197,7 @@ def _restore(state: dict, parameters, optimiser, best: Fit) -> tuple[int, float,
             parameter.copy_(value)
     optimiser.load_state_dict(state["optimiser"])
     kept = fit_from(state["best"], best.law)
-    best.motion, best.error_m, best.discrepancy, best.history = (
-        kept.motion, kept.error_m, kept.discrepancy, kept.history
+    best.motion, best.error_m, best.objective, best.history = (
+        kept.motion, kept.error_m, kept.objective, kept.history
     )  # fmt: skip
     return state["iteration"], state["caution"], state["failures"], state["reach"]

@@ -100,9 +100,10 @@ class Problem:
         self.known = ActiveEffects(members, self.setting()) if members else None
 
     def of_surfaces(self, iterations: int) -> Problem:
-        """The same with ``iterations`` and the loss "surface"."""
+        """The same with ``iterations``, the loss "surface" and more weight of the silhouettes."""
+        changes = {"silhouette_weight": self.config.polish_silhouette_weight, "iterations": iterations}
         other = copy.copy(self)
-        other.config = self.config.model_copy(update={"geometry_loss": "surface", "iterations": iterations})
+        other.config = self.config.model_copy(update={"geometry_loss": "surface", **changes})
         other.surface = torch.from_numpy(np.flatnonzero(surface_points(self.start.numpy())))
         return other
 
