@@ -33,7 +33,7 @@ def fit_table(rows: list[Mapping[str, Any]]) -> str:
             both(row, "psnr_box_db", ".1f"),
             both(row, "ssim_box", ".3f"),
             both(row, "psnr_box_in_scene_db", ".1f"),
-            f"{row['seconds'].get('identify', 0):.0f}",
+            "–" if row["law"] == "told" else f"{row['seconds']['identify']:.0f}",
         ]
         law = row["fitted"] if row["law"] == "true" else row["law"]
         if row["law"] in ("auto", "told"):

@@ -9,8 +9,9 @@ from ring_scene import look_at
 from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.checkpoint import Checkpoint
+from masiv.errors import MasivError
 from masiv.identify import polish
-from masiv.identify.fit import Fit, _objective
+from masiv.identify.fit import Fit, _objective, fit_from, fit_state
 from masiv.identify.problem import Motion, Problem
 from masiv.identify.silhouette import some_of_each
 from masiv.identify.stage import identify
@@ -83,6 +84,13 @@ def test_a_fit_keeps_what_its_whole_objective_likes_best(filmed, seen):  # noqa:
         here = torch.as_tensor(here, dtype=torch.float32)
         problem.targets = here + drift
         assert (_objective(problem, here) < _objective(problem, here + drift)) == prefers_true
+
+
+def test_a_checkpoint_of_an_older_fit_is_refused_in_a_sentence(filmed, seen):  # noqa: F811
+    state = fit_state(thrown(problem_of(filmed, seen), 0.0))
+    del state["objective"]
+    with pytest.raises(MasivError, match="delete what is in checkpoints/"):
+        fit_from(state, load_law(pretrained_path("jelly")))
 
 
 def test_surfaces_have_the_last_word_only_where_silhouettes_can_judge(filmed, seen):  # noqa: F811

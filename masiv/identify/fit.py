@@ -173,7 +173,13 @@ def fit_state(found: Fit) -> dict:
 
 
 def fit_from(state: dict, law: NeuralLaw | AdapterLaw) -> Fit:
-    """The fit of ``state``; ``law``, of its kind and width, becomes its law."""
+    """The fit of ``state``; ``law``, of its kind and width, becomes its law. Raises MasivError for a state that was
+    chosen by something else."""
+    if "objective" not in state:
+        raise MasivError(
+            "identify: the checkpoint is of an older masiv, whose fits were chosen otherwise: delete what is in "
+            "checkpoints/ of the run folder and run the command again"
+        )
     law.load_state_dict(state["law"])
     rows = [tuple(row) for row in state["history"]]
     return Fit(law, Motion(*state["motion"]), state["error_m"], state["objective"], rows)
