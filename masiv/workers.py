@@ -38,14 +38,23 @@ class Failed:
         self.kind = InputError if isinstance(failed, InputError) else MasivError
 
 
+def demanded(found: Any) -> Any:
+    """``found``, unless it is ``Failed``. Raises MasivError, InputError where the input was to blame."""
+    if isinstance(found, Failed):
+        raise found.kind(found.reason)
+    return found
+
+
 class Workers:
-    """``processes`` (1: this one) that run tasks. Use as a context; the processes start with the first tasks.
+    """``processes`` (1: this one) that run tasks. Use as a context; the processes start with the first tasks. key: of
+    the configuration, where their number comes from.
 
     A script that uses more than one needs ``if __name__ == "__main__":`` around what it does, as ever with processes.
     """
 
-    def __init__(self, processes: int = 1) -> None:
+    def __init__(self, processes: int = 1, key: str = "refine.processes") -> None:
         self.processes = processes
+        self.key = key
         self._pool: Any = None
 
     def __enter__(self) -> Workers:
@@ -70,7 +79,7 @@ class Workers:
             for future in futures:
                 yield future.result()
         except BrokenProcessPool as died:
-            raise MasivError("a worker process died, of too little memory perhaps: set refine.processes to 1") from died
+            raise MasivError(f"a worker process died, of too little memory perhaps: set {self.key} to 1") from died
         finally:
             for future in futures:
                 future.cancel()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
+import pickle
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from test_refine import FITTED, OMEGA, VELOCITY, observed, scene
 
 from masiv import runtime
@@ -15,14 +18,16 @@ from masiv.errors import InputError, MasivError
 from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.families import FAMILIES
+from masiv.identify.problem import Motion, Problem
+from masiv.identify.start import choose_start
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.baselines import DONE, baselines, derived
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model, Simulation, parameters
 from masiv.refine.observed import SampledMotion
 from masiv.refine.prepare import experiment_of
-from masiv.refine.tasks import demanded, ranked, side_by_side
-from masiv.workers import Failed, Workers, processes_wanted
+from masiv.refine.tasks import ranked, side_by_side
+from masiv.workers import Failed, Workers, demanded, processes_wanted
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -76,13 +81,36 @@ def test_each_process_runs_on_one_thread_and_this_one_as_before(two):
 
 
 def test_a_process_that_dies_is_told_of():
-    with Workers(2) as workers, pytest.raises(MasivError, match=r"set refine\.processes to 1"):
+    with Workers(2, "identify.processes") as workers, pytest.raises(MasivError, match=r"set identify\.processes to 1"):
         list(workers.map(dies, [(), ()]))
 
 
 def test_as_many_as_asked_or_as_there_are_cores():
     assert processes_wanted(3) == 3
     assert 1 <= processes_wanted(0) <= 4
+
+
+def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
+    monkeypatch.setattr("masiv.identify.start.MODULI", (1e4, 3e4))
+    motion = observed({})
+    motion = SampledMotion(motion.positions[:4], motion.times[:4], motion.volume)
+    config = IdentifyConfig(contact="sticky", samples_per_frame=1)
+    problem = Problem(scene(), motion, config, SimulatorConfig(), particles=150, seed=0)
+    throw = Motion.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
+    alone, beside = (choose_start(problem, throw, quiet, workers) for workers in (Workers(1), two))
+    assert len(alone) == 2
+    for a, b in zip(alone, beside, strict=True):
+        assert (a.material, a.contact, a.error) == (b.material, b.contact, b.error)
+        for name, value in a.law.state_dict().items():
+            assert torch.equal(value, b.law.state_dict()[name])
+
+
+def test_a_scene_goes_to_a_process_without_the_pictures_that_were_read():
+    read = scene()
+    read._cache[0, 0] = "a picture"
+    sent = pickle.loads(pickle.dumps(dataclasses.replace(read, load=halved)))
+    assert sent._cache == {}
+    assert sent.path == read.path
 
 
 def small_simulation():

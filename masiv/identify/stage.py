@@ -25,6 +25,7 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.twin import Twin
+from masiv.workers import Workers, processes_wanted
 
 
 def identify(
@@ -138,7 +139,8 @@ def _neural(
     if "start" in saved:
         start = _start_from(saved["start"])
     else:
-        start = choose_start(few(), motion, progress)[0]
+        with Workers(processes_wanted(problem.config.processes), "identify.processes") as workers:
+            start = choose_start(few(), motion, progress, workers)[0]
     fixed: dict[str, Any] = {"start": _start_state(start)}
     keeper = _With(checkpoint, fixed)
     keeper.save({**saved})

@@ -4,6 +4,7 @@ motion."""
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
 from masiv.materials.pretrain import MATERIALS, pretrained_path
 from masiv.progress import Progress
+from masiv.workers import Workers, demanded
 
 MODULI = (3e3, 1e4, 3e4, 1e5, 3e5)
 """P-wave moduli tried [Pa at 1000 kg/m^3]: waves of 1.7 to 17 m/s, from what sags at once to what hardly deforms in a
@@ -49,27 +51,27 @@ def with_scales(law: NeuralLaw, modulus: float, flow_factor: float) -> NeuralLaw
     return scaled
 
 
-def choose_start(problem: Problem, motion: Motion, progress: Progress) -> list[Start]:
+def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: Workers | None = None) -> list[Start]:
     """Candidates, best first: each material at each of ``MODULI``, then simplex search over stiffness and flow strain;
     the elastic one counts as the better where another is hardly nearer (``TELLS``).
 
-    problem: with few particles. Raises MasivError where every candidate diverges.
+    problem: with few particles. Rollouts run side by side in ``workers``, and give the same to the bit in whichever.
+    Raises MasivError where every candidate diverges.
     """
-    config = problem.config
+    config, workers = problem.config, workers or Workers()
     materials = list(MATERIALS) if config.start == "auto" else [config.start]
     contacts = ["sticky", "release"] if config.contact == "auto" else [config.contact]
     if problem.scene.ground is None:
         contacts = ["none"]
-    laws = {name: load_law(pretrained_path(name)) for name in materials}
     density = problem.scene.density / 1000
-    total = len(materials) * len(contacts) * len(MODULI)
+    tried = [(name, contact, modulus * density) for name in materials for contact in contacts for modulus in MODULI]
     coarse: list[tuple[float, str, str, float]] = []
-    for name in materials:
-        for contact in contacts:
-            for modulus in MODULI:
-                error = _error(problem, motion, laws[name], contact, modulus * density, 1.0)
-                coarse.append((error, name, contact, modulus * density))
-                progress("identify: start", len(coarse), total, f"{name}, {contact}: {said(problem, error)}")
+    if config.geometry_loss == "none":
+        _ = problem.blob_size  # found here once, or each process would find its own
+    found = workers.map(_error, [(problem, motion, *candidate, 1.0) for candidate in tried])
+    for (name, contact, modulus), error in zip(tried, map(demanded, found), strict=True):
+        coarse.append((error, name, contact, modulus))
+        progress("identify: start", len(coarse), len(tried), f"{name}, {contact}: {said(problem, error)}")
     best = {}
     for error, name, contact, modulus in sorted(coarse):
         best.setdefault(name, (error, contact, modulus))
@@ -77,9 +79,9 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress) -> list[S
         raise MasivError("identify: every starting law diverges; check the scene's ground, gravity and units")
     ranked = sorted(best, key=lambda name: best[name][0])[:2]
     starts = []
-    for done, name in enumerate(ranked):
-        _, contact, modulus = best[name]
-        starts.append(_refined(problem, motion, name, laws[name], contact, modulus))
+    searched = workers.map(_searched, [(problem, motion, name, *best[name]) for name in ranked])
+    for done, (name, (modulus, flow, error)) in enumerate(zip(ranked, map(demanded, searched), strict=True)):
+        starts.append(Start(name, best[name][1], with_scales(_pretrained(name), modulus, flow), error))
         progress("identify: start", done + 1, len(ranked), f"{name}: {said(problem, starts[-1].error)}")
     return best_first(starts)
 
@@ -96,9 +98,15 @@ def said(problem: Problem, error: float) -> str:
     return f"silhouettes {error:.3f}" if problem.config.geometry_loss == "none" else f"{1e3 * error:.1f} mm"
 
 
-def _refined(problem: Problem, motion: Motion, name: str, law: NeuralLaw, contact: str, modulus: float) -> Start:
+def _searched(
+    problem: Problem, motion: Motion, name: str, error: float, contact: str, modulus: float
+) -> tuple[float, float, float]:
+    """P-wave modulus [Pa], factor of the flow strain and error after a simplex search from a candidate."""
+
     def objective(logs: np.ndarray) -> float:
-        return _error(problem, motion, law, contact, modulus * math.exp(logs[0]), math.exp(logs[1]))
+        if not logs.any():
+            return error
+        return _error(problem, motion, name, contact, modulus * math.exp(logs[0]), math.exp(logs[1]))
 
     found = minimize(
         objective,
@@ -106,13 +114,17 @@ def _refined(problem: Problem, motion: Motion, name: str, law: NeuralLaw, contac
         method="Nelder-Mead",
         options={"initial_simplex": [[0, 0], [0.5, 0], [0, 0.7]], "maxfev": 24, "xatol": 0.02, "fatol": 1e-4},
     )
-    scaled = with_scales(law, modulus * math.exp(found.x[0]), math.exp(found.x[1]))
-    return Start(name, contact, scaled, float(found.fun))
+    return modulus * math.exp(found.x[0]), math.exp(found.x[1]), float(found.fun)
+
+
+@functools.lru_cache
+def _pretrained(name: str) -> NeuralLaw:
+    return load_law(pretrained_path(name))
 
 
 @torch.no_grad()
-def _error(problem: Problem, motion: Motion, law: NeuralLaw, contact: str, modulus: float, flow: float) -> float:
-    scaled = with_scales(law, modulus, flow)
+def _error(problem: Problem, motion: Motion, name: str, contact: str, modulus: float, flow: float) -> float:
+    scaled = with_scales(_pretrained(name), modulus, flow)
     try:
         return discrepancy(problem, problem.run(scaled, motion, contact, problem.frames))
     except NonFiniteError:

@@ -15,8 +15,8 @@ from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Model, Simulation, parameters
 from masiv.refine.refit import Fitted, column, full_fit, softness, started, summarised
-from masiv.refine.tasks import demanded, side_by_side
-from masiv.workers import Failed, Workers
+from masiv.refine.tasks import side_by_side
+from masiv.workers import Failed, Workers, demanded
 
 SHORT, HALF = 1 / 3, 1 / 2
 DONE = 2

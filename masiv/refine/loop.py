@@ -18,8 +18,8 @@ from masiv.refine.rounds import TELLS_APART, Round, Trial, confusable
 from masiv.refine.score import Candidate, score
 from masiv.refine.second_look import second_look
 from masiv.refine.simulated import Simulated
-from masiv.refine.tasks import demanded, ranked, side_by_side
-from masiv.workers import Failed, Workers
+from masiv.refine.tasks import ranked, side_by_side
+from masiv.workers import Failed, Workers, demanded
 
 Say = Callable[[str, int, int, str], None]
 STOP_GAP = "smooth_force"

@@ -8,7 +8,7 @@ from typing import Any
 from masiv.refine.refit import Fitted
 from masiv.refine.score import Candidate, score
 from masiv.refine.simulated import Simulated
-from masiv.workers import Failed, Workers, attempt
+from masiv.workers import Workers, attempt, demanded
 
 NAMES_A_TASK = 3
 
@@ -25,13 +25,6 @@ def _counted(function: Callable, simulation: Simulated, *task: Any) -> tuple[Any
     out = attempt(function, (simulation, *task))
     done, simulation.rollouts = simulation.rollouts - before, before
     return out, done
-
-
-def demanded(found: Any) -> Any:
-    """``found``, unless it is ``Failed``. Raises MasivError, InputError where the input was to blame."""
-    if isinstance(found, Failed):
-        raise found.kind(found.reason)
-    return found
 
 
 def ranked(

@@ -61,6 +61,10 @@ class Scene:
     fit_frames: int | None = None
     _cache: dict = field(default_factory=dict, repr=False, compare=False)
 
+    def __getstate__(self) -> dict:
+        """Without the pictures that were read: another process reads those that it needs."""
+        return {**self.__dict__, "_cache": {}}
+
     @property
     def times(self) -> np.ndarray:
         """Times of the frames, shape (T,) [s]."""
