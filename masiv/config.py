@@ -24,7 +24,8 @@ DEFAULT_PRESET = "standard"
 
 
 class Config(BaseModel):
-    """What a run is asked to do. ``arch`` is where kernels run; every other key may change the numbers."""
+    """What a run is asked to do. ``arch`` is where kernels run and ``processes`` in how many processes; every other
+    key may change the numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     preset: Preset = DEFAULT_PRESET

@@ -19,7 +19,8 @@ def slab(height):
 
 
 def pulled(hull, means):
-    far = HullPull(hull)(means, 10**6, np.random.default_rng(0))
+    pull = HullPull(hull)
+    far = pull(means, *pull.draw(len(means), 10**6, np.random.default_rng(0)))
     (gradient,) = torch.autograd.grad(far, [means])
     return float(far.detach()), float(gradient[:, 1].sum())
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import taichi as ti
 
-TILE = 8
+TILE = 16
 """Side of a tile [pixels]."""
 CHANNELS = 5
 """Blended channels: red, green, blue, one (alpha), depth."""
@@ -63,6 +63,7 @@ def kernels(real):
                 g = members[k]
                 u, v, a, b, c, o = splats[g, 0], splats[g, 1], splats[g, 2], splats[g, 3], splats[g, 4], splats[g, 5]
                 f = features(splats, g)
+                least = ti.log(real(ALPHA_SKIP) / o)  # spares the exponential where alpha is skipped
                 for y in range(ti.max(top, boxes[g, 1]), ti.min(top + TILE, boxes[g, 3])):
                     for x in range(ti.max(left, boxes[g, 0]), ti.min(left + TILE, boxes[g, 2])):
                         t = transmittance[y, x]
@@ -71,9 +72,9 @@ def kernels(real):
                         dx = real(x + 0.5) - u
                         dy = real(y + 0.5) - v
                         power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
-                        alpha = ti.min(real(ALPHA_LIMIT), o * ti.exp(power))
-                        if power > 0.0 or alpha < ALPHA_SKIP:
+                        if power > 0.0 or power < least:
                             continue
+                        alpha = ti.min(real(ALPHA_LIMIT), o * ti.exp(power))
                         after = t * (1.0 - alpha)
                         if after < STOP:
                             transmittance[y, x] = -t
@@ -105,6 +106,7 @@ def kernels(real):
                 g = members[k]
                 u, v, a, b, c, o = splats[g, 0], splats[g, 1], splats[g, 2], splats[g, 3], splats[g, 4], splats[g, 5]
                 f = features(splats, g)
+                least = ti.log(real(ALPHA_SKIP) / o)  # spares the exponential where alpha is skipped
                 bar = Vec10(0.0)
                 for y in range(ti.max(top, boxes[g, 1]), ti.min(top + TILE, boxes[g, 3])):
                     for x in range(ti.max(left, boxes[g, 0]), ti.min(left + TILE, boxes[g, 2])):
@@ -114,10 +116,10 @@ def kernels(real):
                         dx = real(x + 0.5) - u
                         dy = real(y + 0.5) - v
                         power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy
+                        if power > 0.0 or power < least:
+                            continue
                         gauss = ti.exp(power)
                         alpha = ti.min(real(ALPHA_LIMIT), o * gauss)
-                        if power > 0.0 or alpha < ALPHA_SKIP:
-                            continue
                         after = t * (1.0 - alpha)
                         if after < STOP:
                             transmittance[y, x] = -t

@@ -10,6 +10,11 @@ class ReconstructConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    processes: int = Field(
+        0, ge=0, le=2,
+        description="processes that share the pictures of a step; 0: two where Taichi may use two cores or more; on a "
+        "GPU always one",
+    )  # fmt: skip
     gaussians: int = Field(5000, ge=50, description="Gaussians on the surface of the first frame's hull, at most")
     hull_resolution: int = Field(64, ge=8, le=256, description="voxels along the longest side of a hull")
     crop_side: int = Field(

@@ -24,7 +24,6 @@ from masiv.splat.follow_config import FollowConfig
 from masiv.splat.gaussians import Gaussians
 from masiv.splat.losses import neighbour_pairs
 from masiv.splat.objective import Objective
-from masiv.splat.observe import Observation
 from masiv.splat.pull import HullPull, continue_motion
 from masiv.splat.reconstruct import observations
 
@@ -92,13 +91,20 @@ class _Following:
         self.half_extent = known.settings["half_extent"]
         pulls = {frame: HullPull(hull) for frame, hull in zip(new, hulls[1:], strict=True)}
         scale = float(dynamic.canonical.scales.mean())
-        self.objective = Objective(config, scale, self.half_extent, scene.fps, scene.ground, pulls)
+        self.objective = Objective(config, scale, self.half_extent, scene.fps, scene.ground, pulls, self.observations)
 
         self.known_times = torch.arange(self.known) / scene.fps
         with torch.no_grad():
             self.known_changes = known.changes(means, self.known_times)
         centroids = torch.tensor(np.stack([h.points.mean(axis=0) for h in hulls]), dtype=torch.float32)
-        asked = config.model_dump(), follow_config.model_dump(), seed, str(scene.path), self.known, self.count
+        asked = (
+            config.model_dump(exclude={"processes"}),
+            follow_config.model_dump(),
+            seed,
+            str(scene.path),
+            self.known,
+            self.count,
+        )
         self.identity = repr((*asked, scene.views))
         resumed = state is not None and state["identity"] == self.identity
         self._begin(known, centroids, relearn=not resumed)
@@ -199,12 +205,12 @@ class _Following:
             continue_motion(self.network, self.gaussians["means"], self.frames - 1, c.motion_rate, rng)
         return value
 
-    def _choose_pictures(self, rng: np.random.Generator) -> list[tuple[int, Observation]]:
+    def _choose_pictures(self, rng: np.random.Generator) -> list[tuple[int, int]]:
         """The newest frame while frames come in; others at random among the new ones that are in."""
         frames = rng.integers(self.known, self.frames, size=self.config.pictures)
         if self.settling == 0:
             frames[0] = self.frames - 1
-        return [(int(f), self.observations[int(f)][rng.integers(len(self.observations[int(f)]))]) for f in frames]
+        return [(int(f), int(rng.integers(len(self.observations[int(f)])))) for f in frames]
 
 
 def _parameters(gaussians: Gaussians) -> dict[str, torch.Tensor]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import torch
 
+from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.progress import Progress
@@ -17,14 +19,14 @@ from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.gaussians import Gaussians
 from masiv.splat.losses import neighbour_pairs
-from masiv.splat.objective import Objective
+from masiv.splat.objective import NAMES, Objective, Part
 from masiv.splat.observe import Observation, observe
 from masiv.splat.pull import HullPull, continue_motion
+from masiv.splat.share import Second, leaves, slopes
 from masiv.splat.start import Start, starting_point
+from masiv.workers import processes_wanted
 
 __all__ = ["DynamicGaussians", "observations", "reconstruct"]
-
-_NAMES = ("means", "log_scales", "opacity_logits", "colour_logits")
 
 
 def reconstruct(
@@ -36,12 +38,15 @@ def reconstruct(
     followed instead of found again. Raises MasivError where no frame shows the object or the fit diverges.
     A finished stage leaves its last state in ``checkpoint``; whoever saves the result clears it.
     """
-    fit = _Fit(scene, config, seed, checkpoint.load(), progress)
-    while fit.iteration < config.iterations:
-        loss = fit.step()
-        checkpoint.maybe_save(fit.state)
-        if fit.iteration % 10 == 0 or fit.iteration == config.iterations:
-            progress("reconstruct", fit.iteration, config.iterations, f"loss {loss:.4f}, {fit.frames} frames")
+    two = config.pictures > 1 and processes_wanted(config.processes) > 1
+    # On a few cores, two processes on half the threads each; the numbers depend on the threads, not on the processes.
+    with runtime.torch_threads(max(1, torch.get_num_threads() // 2)), Second() if two else nullcontext() as second:
+        fit = _Fit(scene, config, seed, checkpoint.load(), progress, second)
+        while fit.iteration < config.iterations:
+            loss = fit.step()
+            checkpoint.maybe_save(fit.state)
+            if fit.iteration % 10 == 0 or fit.iteration == config.iterations:
+                progress("reconstruct", fit.iteration, config.iterations, f"loss {loss:.4f}, {fit.frames} frames")
     return DynamicGaussians(fit.canonical(), fit.network.eval().requires_grad_(False))
 
 
@@ -49,20 +54,32 @@ class _Fit:
     """The state of a fit and one step of it. Everything random comes from (seed, iteration)."""
 
     def __init__(
-        self, scene: Scene, config: ReconstructConfig, seed: int, state: dict | None, progress: Progress
+        self,
+        scene: Scene,
+        config: ReconstructConfig,
+        seed: int,
+        state: dict | None,
+        progress: Progress,
+        second: Second | None = None,
     ) -> None:
-        self.config, self.seed, self.scene = config, seed, scene
+        self.config, self.seed, self.scene, self.second = config, seed, scene, second
         self.observations = observations(scene, config, range(scene.frame_count))
-        self.identity = repr((config.model_dump(), seed, str(scene.path), scene.frame_count, scene.views))
+        self.identity = repr(
+            (config.model_dump(exclude={"processes"}), seed, str(scene.path), scene.frame_count, scene.views)
+        )
         progress("reconstruct", 0, config.iterations, "carving hulls")
         start = starting_point(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
         self.half_extent = start.half_extent
         hulls = tuple(HullPull(hull) for hull in start.hulls)
-        self.objective = Objective(config, start.scale, start.half_extent, scene.fps, scene.ground, hulls)
+        self.objective = Objective(
+            config, start.scale, start.half_extent, scene.fps, scene.ground, hulls, self.observations
+        )
         if state is not None and state["identity"] == self.identity:
             self._resume(state)
         else:
             self._begin(start)
+        if second is not None:
+            second.give(self.objective, self.network, len(self.parameters["means"]))
 
     def _begin(self, start: Start) -> None:
         self.iteration = 0
@@ -114,10 +131,10 @@ class _Fit:
 
     def _start_optimiser(self) -> None:
         c, extent = self.config, self.half_extent
-        rates = dict(zip(_NAMES, (c.means_rate * extent, c.scale_rate, c.opacity_rate, c.colour_rate), strict=True))
+        rates = dict(zip(NAMES, (c.means_rate * extent, c.scale_rate, c.opacity_rate, c.colour_rate), strict=True))
         self.parameters = {name: value.requires_grad_() for name, value in self.parameters.items()}
         weights = [p for name, p in self.network.named_parameters() if name != "base_motion"]
-        groups = [{"params": [self.parameters[name]], "rate": rates[name]} for name in _NAMES]
+        groups = [{"params": [self.parameters[name]], "rate": rates[name]} for name in NAMES]
         groups += [{"params": weights, "rate": c.motion_rate}]
         groups += [{"params": [self.network.base_motion], "rate": c.base_rate * extent}]
         self.optimiser = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
@@ -159,15 +176,13 @@ class _Fit:
         if self.frames > 1:
             # Points that go on sliding over the surface while frames come in would take the motion with them.
             self.optimiser.param_groups[0]["lr"] *= c.followed_rate
-        self.optimiser.zero_grad(set_to_none=True)
-        loss = self.objective(self.parameters, self.network, self.pairs, pictures, 1 - self.settling, rng)
-        value = float(loss.detach())
+        parts = self.objective.parts(len(self.parameters["means"]), pictures, 1 - self.settling, rng)
+        value = self._find_slopes(parts)
         if not np.isfinite(value):
             raise MasivError(
                 f"reconstruct diverged at step {self.iteration} of {c.iterations}: lower reconstruct.motion_rate and "
                 "reconstruct.means_rate"
             )
-        loss.backward()
         self.optimiser.step()
         frames = self.frames
         self.iteration += 1
@@ -178,12 +193,26 @@ class _Fit:
             self._prune()
         return value
 
-    def _choose_pictures(self, rng: np.random.Generator) -> list[tuple[int, Observation]]:
+    def _find_slopes(self, parts: tuple[Part, ...]) -> float:
+        """Set the gradient of every parameter to the sum over ``parts``, in their order; the loss."""
+        given = (self.objective, self.parameters, self.network, self.pairs)
+        if self.second is None:
+            found = [slopes(*given, part) for part in parts]
+        else:
+            first, other = parts
+            self.second.begin(*given[1:], other)
+            found = [slopes(*given, first), self.second.end()]
+        for leaf, *each in zip(leaves(self.parameters, self.network), *(s for _, s in found), strict=True):
+            known = [slope for slope in each if slope is not None]
+            leaf.grad = sum(known[1:], known[0]) if known else None
+        return sum(value for value, _ in found)
+
+    def _choose_pictures(self, rng: np.random.Generator) -> list[tuple[int, int]]:
         """The newest frame while frames come in, so that it is followed before the next one comes; others at random."""
         frames = rng.integers(self.frames, size=self.config.pictures)
         if self.frames < self.scene.frame_count:
             frames[0] = self.frames - 1
-        return [(int(f), self.observations[f][rng.integers(len(self.observations[f]))]) for f in frames]
+        return [(int(f), int(rng.integers(len(self.observations[f])))) for f in frames]
 
     def _pruning_steps(self) -> tuple[int, ...]:
         """After frame 0 alone, and twice while all frames are in."""
@@ -196,7 +225,7 @@ class _Fit:
         keep = torch.sigmoid(self.parameters["opacity_logits"].detach()) >= self.config.prune_opacity
         if int(keep.sum()) < 2:
             raise MasivError("reconstruct: every Gaussian became transparent; check the masks of the scene")
-        for group, name in zip(self.optimiser.param_groups, _NAMES, strict=False):
+        for group, name in zip(self.optimiser.param_groups, NAMES, strict=False):
             old = self.parameters[name]
             new = old.detach()[keep].clone().requires_grad_()
             moments = self.optimiser.state.pop(old)
