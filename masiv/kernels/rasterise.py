@@ -22,6 +22,10 @@ CHANNELS = 5
 SPLAT_SIZE = 10
 """Entries of a projected Gaussian: u, v, conic A, B, C, opacity, red, green, blue, depth."""
 
+LOW_PASS = 0.3
+"""Added to the variance of a projected Gaussian [pixels^2]: it never falls between pixels (Kerbl et al. 2023)."""
+NEAR = 0.01
+"""Gaussians nearer to the camera plane than this [m] are not drawn."""
 ALPHA_SKIP = 1.0 / 255.0
 ALPHA_LIMIT = 0.99
 STOP = 1e-4
@@ -31,20 +35,76 @@ STOP = 1e-4
 def kernels(real):
     """The kernels for the Taichi type ``real`` (ti.f32 or ti.f64).
 
-    splats (N, 10), boxes (N, 4) int32: pixels x0, y0, x1, y1 (half-open) that a Gaussian can reach; tile_start
-    (tiles + 1,) int32 into ``members`` (Gaussian, front to back within a tile) and ``slots``; image (H, W, 5);
-    transmittance (H, W), ones at first.
+    camera (17,): rotation (row by row) and translation from the world, then fx, skew, fy, cx, cy; splats (N, 10);
+    boxes (N, 4) int32: pixels x0, y0, x1, y1 (half-open) that a Gaussian can reach, empty where it is not drawn;
+    tile_start (tiles + 1,) int32 into ``members`` (Gaussian, front to back within a tile) and ``slots``; image
+    (H, W, 5); transmittance (H, W), ones at first.
     """
     Array1 = ti.types.ndarray(dtype=ti.i32, ndim=1)
     Boxes = ti.types.ndarray(dtype=ti.i32, ndim=2)
     Rows = ti.types.ndarray(dtype=real, ndim=2)
+    Numbers = ti.types.ndarray(dtype=real, ndim=1)
     Picture = ti.types.ndarray(dtype=real, ndim=3)
+    Vec3 = ti.types.vector(3, real)
+    Vec4 = ti.types.vector(4, real)
     Vec5 = ti.types.vector(CHANNELS, real)
     Vec10 = ti.types.vector(SPLAT_SIZE, real)
 
     @ti.func
     def features(splats: ti.template(), g):
         return Vec5(splats[g, 6], splats[g, 7], splats[g, 8], real(1.0), splats[g, 9])
+
+    @ti.func
+    def seen(camera: ti.template(), means: ti.template(), g):
+        """The mean in the camera's axes."""
+        return Vec3([
+            camera[3 * i] * means[g, 0] + camera[3 * i + 1] * means[g, 1] + camera[3 * i + 2] * means[g, 2]
+            + camera[9 + i] for i in ti.static(range(3))
+        ])  # fmt: skip
+
+    @ti.kernel
+    def project(
+        camera: Numbers,
+        means: Rows,
+        scales: Numbers,
+        opacities: Numbers,
+        colours: Rows,
+        splats: Rows,
+        boxes: Boxes,
+        width: ti.i32,
+        height: ti.i32,
+    ):
+        """EWA projection (Zwicker et al. 2001). Rows of its Jacobian are (fx, skew, -u) / z and (0, fy, -v) / z."""
+        for g in range(means.shape[0]):
+            fx, skew, fy = camera[12], camera[13], camera[14]
+            p = seen(camera, means, g)
+            near = p[2] <= real(NEAR)
+            inverse = real(1.0) / (real(1.0) if near else p[2])
+            u, v = (fx * p[0] + skew * p[1]) * inverse, fy * p[1] * inverse
+            spread, low_pass = (scales[g] * inverse) ** 2, real(LOW_PASS)
+            xx = spread * (fx * fx + skew * skew + u * u) + low_pass
+            xy = spread * (skew * fy + u * v)
+            yy = spread * (fy * fy + v * v) + low_pass
+            determinant = xx * yy - xy * xy
+            u += camera[15]
+            v += camera[16]
+            splats[g, 0], splats[g, 1] = u, v
+            splats[g, 2], splats[g, 3], splats[g, 4] = yy / determinant, -xy / determinant, xx / determinant
+            splats[g, 5] = opacities[g]
+            for i in ti.static(range(3)):
+                splats[g, 6 + i] = colours[g, i]
+            splats[g, 9] = p[2]
+            least = real(ALPHA_SKIP) / opacities[g]
+            reach = ti.sqrt(-2.0 * ti.log(ti.min(least, real(1.0))))
+            low_x = ti.max(ti.ceil(u - reach * ti.sqrt(xx) - 0.5), 0.0)
+            low_y = ti.max(ti.ceil(v - reach * ti.sqrt(yy) - 0.5), 0.0)
+            high_x = ti.min(ti.floor(u + reach * ti.sqrt(xx) - 0.5) + 1.0, real(width))
+            high_y = ti.min(ti.floor(v + reach * ti.sqrt(yy) - 0.5) + 1.0, real(height))
+            drawn = not near and opacities[g] > real(ALPHA_SKIP) and high_x > low_x and high_y > low_y
+            boxes[g, 0] = ti.cast(low_x, ti.i32) if drawn else 0
+            boxes[g, 1] = ti.cast(low_y, ti.i32) if drawn else 0
+            boxes[g, 2] = ti.cast(high_x, ti.i32) if drawn else 0
+            boxes[g, 3] = ti.cast(high_y, ti.i32) if drawn else 0
 
     @ti.kernel
     def blend(
@@ -148,8 +208,19 @@ def kernels(real):
                     slot_bar[s, i] = bar[i]
 
     @ti.kernel
-    def sum_slots(slot_bar: Rows, first_slot: Array1, splat_bar: Rows):
-        """splat_bar (N, 10): the sum of each Gaussian's slots first_slot[g] ... first_slot[g + 1] - 1, in order."""
+    def project_adjoint(
+        camera: Numbers,
+        means: Rows,
+        scales: Numbers,
+        splats: Rows,
+        slot_bar: Rows,
+        first_slot: Array1,
+        means_bar: Rows,
+        scales_bar: Numbers,
+        splat_bar: Rows,
+    ):
+        """splat_bar (N, 10): the sum of each Gaussian's slots first_slot[g] ... first_slot[g + 1] - 1, in order; from
+        there to means and scales. The conic is the inverse of the covariance C, so C_bar = -C^-1 conic_bar C^-1."""
         for g in range(splat_bar.shape[0]):
             total = Vec10(0.0)
             for s in range(first_slot[g], first_slot[g + 1]):
@@ -157,5 +228,33 @@ def kernels(real):
                     total[i] += slot_bar[s, i]
             for i in ti.static(range(SPLAT_SIZE)):
                 splat_bar[g, i] = total[i]
+            fx, skew, fy = camera[12], camera[13], camera[14]
+            p = seen(camera, means, g)
+            near = p[2] <= real(NEAR)
+            inverse = real(1.0) / (real(1.0) if near else p[2])
+            u, v = (fx * p[0] + skew * p[1]) * inverse, fy * p[1] * inverse
+            q = scales[g] * inverse
+            a, b, c = splats[g, 2], splats[g, 3], splats[g, 4]
+            half = total[3] * 0.5
+            left = Vec4(
+                a * total[2] + b * half, a * half + b * total[4], b * total[2] + c * half, b * half + c * total[4]
+            )
+            xx_bar = -(left[0] * a + left[1] * b)
+            xy_bar = -2.0 * (left[0] * b + left[1] * c)
+            yy_bar = -(left[2] * b + left[3] * c)
+            spread = q * q
+            spread_bar = (
+                xx_bar * (fx * fx + skew * skew + u * u) + xy_bar * (skew * fy + u * v) + yy_bar * (fy * fy + v * v)
+            )
+            u_bar = total[0] + spread * (2.0 * u * xx_bar + v * xy_bar)
+            v_bar = total[1] + spread * (u * xy_bar + 2.0 * v * yy_bar)
+            q_bar = 2.0 * q * spread_bar
+            inverse_bar = q_bar * scales[g] + u_bar * (fx * p[0] + skew * p[1]) + v_bar * fy * p[1]
+            x_bar = u_bar * fx * inverse
+            y_bar = (u_bar * skew + v_bar * fy) * inverse
+            z_bar = total[9] - (real(0.0) if near else inverse_bar * inverse * inverse)
+            scales_bar[g] = q_bar * inverse
+            for i in ti.static(range(3)):
+                means_bar[g, i] = camera[i] * x_bar + camera[3 + i] * y_bar + camera[6 + i] * z_bar
 
-    return SimpleNamespace(blend=blend, blend_adjoint=blend_adjoint, sum_slots=sum_slots)
+    return SimpleNamespace(project=project, blend=blend, blend_adjoint=blend_adjoint, project_adjoint=project_adjoint)

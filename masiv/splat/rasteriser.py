@@ -1,4 +1,4 @@
-"""Differentiable pictures of isotropic Gaussians: projection in torch, blending in masiv/kernels/rasterise.py."""
+"""Differentiable pictures of isotropic Gaussians; the arithmetic is in masiv/kernels/rasterise.py."""
 
 from __future__ import annotations
 
@@ -10,11 +10,6 @@ import torch
 
 from masiv.errors import MasivError
 from masiv.scene.camera import Camera
-
-LOW_PASS = 0.3
-"""Added to the variance of a projected Gaussian [pixels^2]: it never falls between pixels (Kerbl et al. 2023)."""
-NEAR = 0.01
-"""Gaussians nearer to the camera plane than this [m] are not drawn."""
 
 
 @dataclass(frozen=True)
@@ -39,51 +34,18 @@ def render(
     means (N, 3) [m]; scales (N,) standard deviations [m]; opacities (N,) in [0, 1]; colours (N, 3); background (3,).
     float32 or float64, after ``masiv.runtime.start``. Raises MasivError where a projected Gaussian is not finite.
     """
-    centres, covariances, depths = project(camera, means, scales)
-    a, b, c = covariances.unbind(1)
-    determinant = a * c - b * b
-    conics = torch.stack([c, -b, a], dim=1) / determinant[:, None]
-    splats = torch.cat([centres, conics, opacities[:, None], colours, depths[:, None]], dim=1)
-    with torch.no_grad():
-        if not torch.isfinite(splats).all():
-            raise MasivError(f"view {camera.name}: a Gaussian is not finite; lower the learning rates of reconstruct")
-        boxes = _boxes(camera, centres, a, c, opacities, depths)
-    image = _Blend.apply(splats, boxes, depths.detach(), camera.width, camera.height)
+    image = _Draw.apply(means, scales, opacities, colours, camera)
     alpha = image[..., 3]
     seen = alpha > 0
     depth = torch.where(seen, image[..., 4] / torch.where(seen, alpha, 1.0), 0.0)
     return Rendering(image[..., :3] + (1 - alpha)[..., None] * background.to(image), alpha, depth)
 
 
-def project(
-    camera: Camera, means: torch.Tensor, scales: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """EWA projection (Zwicker et al. 2001) of Gaussians: centres (N, 2) [pixels], covariances xx, xy, yy (N, 3)
-    [pixels^2] with the low-pass, depths (N,) [m]. Those nearer than NEAR get a harmless stand-in depth of 1 m here."""
-    pose = torch.as_tensor(camera.world_to_camera, dtype=means.dtype, device=means.device)
-    k = camera.intrinsics
-    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    inverse = 1 / torch.where(z > NEAR, z, 1.0)
-    u = (float(k[0, 0]) * x + float(k[0, 1]) * y) * inverse
-    v = float(k[1, 1]) * y * inverse
-    # Rows of the projection's Jacobian are (fx, skew, -u) / z and (0, fy, -v) / z.
-    spread = (scales * inverse).square()
-    xx = spread * (float(k[0, 0] ** 2 + k[0, 1] ** 2) + u * u) + LOW_PASS
-    xy = spread * (float(k[0, 1] * k[1, 1]) + u * v)
-    yy = spread * (float(k[1, 1] ** 2) + v * v) + LOW_PASS
-    centres = torch.stack([u + float(k[0, 2]), v + float(k[1, 2])], dim=1)
-    return centres, torch.stack([xx, xy, yy], dim=1), z
-
-
-def _boxes(camera: Camera, centres: Any, xx: Any, yy: Any, opacities: Any, depths: Any) -> torch.Tensor:
-    """Pixels (x0, y0, x1, y1), half-open, whose alpha can reach 1/255: (N, 4) int32; empty for what is not drawn."""
-    drawn = (opacities * 255 > 1) & (depths > NEAR)
-    reach = (2 * torch.log(torch.where(drawn, opacities * 255, 1.0))).sqrt()[:, None] * torch.stack([xx, yy], 1).sqrt()
-    limit = torch.tensor([camera.width, camera.height], dtype=centres.dtype, device=centres.device)
-    low = (centres - reach - 0.5).ceil().clamp(min=0).minimum(limit)
-    high = ((centres + reach - 0.5).floor() + 1).clamp(min=0).minimum(limit)
-    empty = (high <= low).any(1, keepdim=True) | ~drawn[:, None]
-    return torch.cat([low, high], dim=1).masked_fill(empty, 0).to(torch.int32)
+def _numbers(camera: Camera, like: torch.Tensor) -> torch.Tensor:
+    """``camera`` as the kernels read it."""
+    pose, k = camera.world_to_camera, camera.intrinsics
+    values = [*pose[:3, :3].ravel(), *pose[:3, 3], k[0, 0], k[0, 1], k[1, 1], k[0, 2], k[1, 2]]
+    return torch.tensor(values, dtype=like.dtype)
 
 
 def _bin(boxes: torch.Tensor, depths: torch.Tensor, columns: int, rows: int) -> tuple[torch.Tensor, ...]:
@@ -111,36 +73,49 @@ def _bin(boxes: torch.Tensor, depths: torch.Tensor, columns: int, rows: int) -> 
     return tuple(t.to(torch.int32).contiguous() for t in (tile_start, members, slots, first_slot))
 
 
-class _Blend(torch.autograd.Function):
-    """splats (N, 10) -> image (H, W, 5): red, green, blue, alpha, alpha-weighted depth, over nothing."""
+class _Draw(torch.autograd.Function):
+    """Gaussians -> image (H, W, 5): red, green, blue, alpha, alpha-weighted depth, over nothing."""
 
     @staticmethod
     def forward(
-        ctx: Any, splats: torch.Tensor, boxes: torch.Tensor, depths: torch.Tensor, width: int, height: int
+        ctx: Any,
+        means: torch.Tensor,
+        scales: torch.Tensor,
+        opacities: torch.Tensor,
+        colours: torch.Tensor,
+        camera: Camera,
     ) -> Any:
-        from masiv.kernels.rasterise import CHANNELS, TILE
+        from masiv.kernels.rasterise import CHANNELS, SPLAT_SIZE, TILE
 
-        columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
-        splats = splats.detach().contiguous()
-        tile_start, members, slots, first_slot = _bin(boxes, depths, columns, rows)
-        image = splats.new_zeros(height, width, CHANNELS)
+        means, scales, opacities, colours = (t.detach().contiguous() for t in (means, scales, opacities, colours))
+        kernels, numbers = _kernels(means.dtype), _numbers(camera, means)
+        splats = means.new_empty(len(means), SPLAT_SIZE)
+        boxes = torch.empty(len(means), 4, dtype=torch.int32)
+        if len(means):
+            kernels.project(numbers, means, scales, opacities, colours, splats, boxes, camera.width, camera.height)
+        if not torch.isfinite(splats).all():
+            raise MasivError(f"view {camera.name}: a Gaussian is not finite; lower the learning rates of reconstruct")
+        columns, rows = math.ceil(camera.width / TILE), math.ceil(camera.height / TILE)
+        tile_start, members, slots, first_slot = _bin(boxes, splats[:, 9], columns, rows)
+        image = splats.new_zeros(camera.height, camera.width, CHANNELS)
         if len(members):
-            transmittance = splats.new_ones(height, width)
-            _kernels(splats.dtype).blend(splats, boxes, tile_start, members, image, transmittance, columns)
-        ctx.save_for_backward(splats, boxes, tile_start, members, slots, first_slot, image)
+            transmittance = splats.new_ones(camera.height, camera.width)
+            kernels.blend(splats, boxes, tile_start, members, image, transmittance, columns)
+        ctx.save_for_backward(numbers, means, scales, splats, boxes, tile_start, members, slots, first_slot, image)
         ctx.columns = columns
         return image
 
     @staticmethod
     def backward(ctx: Any, image_bar: torch.Tensor) -> Any:
-        splats, boxes, tile_start, members, slots, first_slot, image = (t.detach() for t in ctx.saved_tensors)
-        splat_bar = torch.zeros_like(splats)
+        saved = (t.detach() for t in ctx.saved_tensors)
+        numbers, means, scales, splats, boxes, tile_start, members, slots, first_slot, image = saved
+        means_bar, scales_bar, splat_bar = (torch.zeros_like(t) for t in (means, scales, splats))
         if len(members):
             image_bar = image_bar.contiguous()
             behind = (image_bar * image).sum(2)
             slot_bar = splats.new_empty(len(members), splats.shape[1])
-            module = _kernels(splats.dtype)
-            module.blend_adjoint(
+            kernels = _kernels(splats.dtype)
+            kernels.blend_adjoint(
                 splats,
                 boxes,
                 tile_start,
@@ -152,8 +127,10 @@ class _Blend(torch.autograd.Function):
                 slot_bar,
                 ctx.columns,
             )
-            module.sum_slots(slot_bar, first_slot, splat_bar)
-        return splat_bar, None, None, None, None
+            kernels.project_adjoint(
+                numbers, means, scales, splats, slot_bar, first_slot, means_bar, scales_bar, splat_bar
+            )
+        return means_bar, scales_bar, splat_bar[:, 5], splat_bar[:, 6:9], None
 
 
 def _kernels(dtype: torch.dtype) -> Any:
