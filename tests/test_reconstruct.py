@@ -14,11 +14,14 @@ from masiv.scene.camera import Camera
 from masiv.scene.scene import Frame, Scene
 from masiv.splat._reference import _render
 from masiv.splat.config import ReconstructConfig
+from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.losses import ssim, strain
+from masiv.splat.objective import NAMES, Objective, Part
 from masiv.splat.observe import observe
 from masiv.splat.rasteriser import render
 from masiv.splat.reconstruct import reconstruct
+from masiv.splat.share import Second
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -148,6 +151,71 @@ def test_resumed_run_ends_with_the_same_numbers(scene, result, tmp_path):
         assert torch.equal(getattr(again.canonical, name), getattr(result.canonical, name)), name
     for name, value in result.deformation.state_dict().items():
         assert torch.equal(value, again.deformation.state_dict()[name]), name
+
+
+def same(one, other):
+    gaussians = ("means", "scales", "opacities", "colours")
+    return all(torch.equal(getattr(one.canonical, n), getattr(other.canonical, n)) for n in gaussians) and all(
+        torch.equal(value, other.deformation.state_dict()[n]) for n, value in one.deformation.state_dict().items()
+    )
+
+
+def test_two_processes_end_with_the_numbers_of_one(scene, tmp_path):
+    """Through frames that come in, pruning and a resume in the other number of processes."""
+    one, two = (CONFIG.model_copy(update={"iterations": 60, "processes": n}) for n in (1, 2))
+    whole = reconstruct(scene, one, seed=4, checkpoint=Checkpoint(None), progress=silent)
+    checkpoint = Checkpoint(tmp_path / "state.pt", every_s=0.0)
+
+    def interrupt(stage, done, total, note=""):
+        if done == 40:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(scene, one, seed=4, checkpoint=checkpoint, progress=interrupt)
+    assert checkpoint.load()["iteration"] == 40
+    assert same(whole, reconstruct(scene, two, seed=4, checkpoint=checkpoint, progress=silent))
+    assert same(whole, reconstruct(scene, two, seed=4, checkpoint=Checkpoint(None), progress=silent))
+
+
+def test_a_second_process_that_dies_is_told_of_and_none_is_left(scene, monkeypatch):
+    started = []
+
+    class Dies(Second):
+        def __init__(self):
+            super().__init__()
+            started.append(self._process)
+
+        def begin(self, *given):
+            if len(started) == 1:
+                started.append(self._process.kill())
+            super().begin(*given)
+
+    monkeypatch.setattr("masiv.splat.reconstruct.Second", Dies)
+    config = CONFIG.model_copy(update={"iterations": 5, "processes": 2})
+    with pytest.raises(MasivError, match=r"set reconstruct\.processes to 1"):
+        reconstruct(scene, config, seed=4, checkpoint=Checkpoint(None), progress=silent)
+    assert started[0].returncode is not None
+
+
+def test_what_the_second_process_cannot_draw_is_told_of(scene):
+    """Its objective alone is broken: the picture that it is given has a camera of no number."""
+    nowhere = dataclasses.replace(scene.cameras[0], world_to_camera=np.full((4, 4), np.nan))
+    seen = dataclasses.replace(observe(scene, 0, 0, crop_side=40, crop_padding=4), camera=nowhere)
+    objective = Objective(CONFIG, 0.01, 0.2, FPS, None, (), [[seen]])
+    gaussians = {n: torch.zeros(4, *s) for n, s in zip(NAMES, ((3,), (), (), (3,)), strict=True)}
+    network = DeformationNetwork(
+        centre=torch.zeros(3), half_extent=0.2, frame_count=2, fps=FPS, base_motion=torch.zeros(2, 3)
+    )
+    pairs = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long)
+    part = Part(((0, 0, np.zeros(3)),), 1, (0,), 1, None, sizes=True)
+    with Second() as second:
+        second.give(objective, network, 4)
+        for _ in range(2):  # it goes on
+            second.begin(gaussians, network, pairs, part)
+            with pytest.raises(MasivError, match="not finite"):
+                second.end()
+        process = second._process
+    assert process.returncode == 0
 
 
 def test_state_of_another_run_is_not_used(scene, tmp_path):

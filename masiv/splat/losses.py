@@ -16,15 +16,16 @@ def ssim(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     """Structural similarity (Wang et al. 2004) of pictures (H, W, C) in [0, 1], a scalar; window 11, sigma 1.5.
 
     Pictures here are small, so the blur is two products with banded matrices, cheaper than a convolution. The window is
-    cut and renormalised at the border.
+    cut and renormalised at the border. What depends on ``other`` alone is blurred apart: it mostly has no gradient.
     """
     height, width, _ = one.shape
     rows, columns = _blur(height, one.dtype), _blur(width, one.dtype)
-    stack = torch.cat([one, other, one * one, other * other, one * other], dim=2).permute(2, 0, 1)
-    mean1, mean2, square1, square2, product = (rows @ stack @ columns.T).chunk(5)
-    variance1, variance2, covariance = square1 - mean1**2, square2 - mean2**2, product - mean1 * mean2
-    luminance = (2 * mean1 * mean2 + _C1) / (mean1**2 + mean2**2 + _C1)
-    structure = (2 * covariance + _C2) / (variance1 + variance2 + _C2)
+    one, other = (picture.permute(2, 0, 1).contiguous() for picture in (one, other))
+    mean1, square1, product = (rows @ torch.cat([one, one * one, one * other]) @ columns.T).chunk(3)
+    mean2, square2 = (rows @ torch.cat([other, other * other]) @ columns.T).chunk(2)
+    both, means = mean1 * mean2, mean1 * mean1 + mean2 * mean2
+    luminance = (2 * both + _C1) / (means + _C1)
+    structure = (2 * (product - both) + _C2) / (square1 + square2 - means + _C2)
     return (luminance * structure).mean()
 
 

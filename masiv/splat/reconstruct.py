@@ -137,7 +137,7 @@ class _Fit:
         groups = [{"params": [self.parameters[name]], "rate": rates[name]} for name in NAMES]
         groups += [{"params": weights, "rate": c.motion_rate}]
         groups += [{"params": [self.network.base_motion], "rate": c.base_rate * extent}]
-        self.optimiser = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
+        self.optimiser = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
         self._find_neighbours()
 
     def _find_neighbours(self) -> None:
