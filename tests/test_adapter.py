@@ -107,7 +107,7 @@ def test_fit_of_an_adapter_improves_on_its_base_and_resumes(body, tmp_path):  # 
 
     # A body that yields, which no elastic law does.
     seen = filmed(body, ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=2e3))
-    config = settings("adapter", adapter_base="neo_hookean", family_rollouts=12, iterations=4, silhouette_pictures=0)
+    config = settings("adapter", adapter_base="neo_hookean", family_rollouts=12, iterations=4, pictures=0)
     whole = identify(scene(), seen, config, SimulatorConfig())
     assert whole.law.kind == "adapter"
     assert whole.fit["trajectory_error_mm"] <= whole.fit["classical_error_mm"] + 0.1

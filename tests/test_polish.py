@@ -11,9 +11,10 @@ from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen, settings 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.identify import polish
-from masiv.identify.fit import Fit, _objective, fit_from, fit_state
+from masiv.identify.fit import Fit, fit_from, fit_state
+from masiv.identify.objective import objective
+from masiv.identify.pictures import some_of_each
 from masiv.identify.problem import Motion, Problem
-from masiv.identify.silhouette import some_of_each
 from masiv.identify.stage import identify
 from masiv.materials.load import load_law
 from masiv.materials.pretrain import pretrained_path
@@ -46,7 +47,7 @@ def filmed(seen):  # noqa: F811
 
 
 def problem_of(filmed, seen, **changes):  # noqa: F811
-    config = settings(silhouette_pictures=4, iterations=16, **changes)
+    config = settings(pictures=4, iterations=16, **changes)
     return Problem(filmed, seen[0], config, SimulatorConfig())
 
 
@@ -83,7 +84,7 @@ def test_a_fit_keeps_what_its_whole_objective_likes_best(filmed, seen):  # noqa:
         here = problem.axes.points_to_simulation(true[1 : problem.frames + 1].double().numpy())
         here = torch.as_tensor(here, dtype=torch.float32)
         problem.targets = here + drift
-        assert (_objective(problem, here) < _objective(problem, here + drift)) == prefers_true
+        assert (objective(problem, here) < objective(problem, here + drift)) == prefers_true
 
 
 def test_a_checkpoint_of_an_older_fit_is_refused_in_a_sentence(filmed, seen):  # noqa: F811
@@ -108,7 +109,7 @@ def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers
     class Stop(Exception):
         pass
 
-    config = settings(iterations=4, silhouette_pictures=1)
+    config = settings(iterations=4, pictures=1)
     whole = identify(filmed, seen[0], config, SimulatorConfig())
     assert whole.fit["silhouette_error_of_surfaces"] > 0
     assert [row["iteration"] for row in whole.fit["history"]] in ([0, 1, 2, 3, 4, 5], [0, 1, 2, 3])

@@ -54,9 +54,11 @@ class IdentifyConfig(BaseModel):
     trajectory_weight: float = Field(1.0, ge=0, description="of geometry_loss")
     silhouette_weight: float = Field(0.2, ge=0, description="of the silhouettes, while paths lead")
     polish_silhouette_weight: float = Field(1.0, ge=0, description="of the silhouettes, after the paths")
+    paint_weight: float = Field(0.0, ge=0, description="of the paint that particles carry along, while paths lead")
+    polish_paint_weight: float = Field(1.0, ge=0, description="of the paint, after the paths")
     prior_weight: float = Field(
         1e-2, ge=0,
         description="of the mean square by which a neural law's log moduli and log rates leave those it started with, "
         "over all strains: what the motion does not tell stays as it was",
     )  # fmt: skip
-    silhouette_pictures: int = Field(4, ge=0, description="pictures whose silhouette is compared in an iteration")
+    pictures: int = Field(4, ge=0, description="pictures with which an iteration compares silhouette and paint")

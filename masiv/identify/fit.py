@@ -12,8 +12,9 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
+from masiv.identify.objective import objective
+from masiv.identify.pictures import compared, picture_errors, picture_objective
 from masiv.identify.problem import Motion, Problem
-from masiv.identify.silhouette import silhouette_errors, some_of_each
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
@@ -88,9 +89,10 @@ def fit(
         try:
             positions = problem.run(law, motion, contact, frames)
             error = problem.error(positions)
-            silhouette = _silhouette(problem, positions, frames, seed, i)
+            outline, paint = _pictures(problem, positions, frames, seed, i)
             geometry = error if config.geometry_loss == "trajectory" else problem.geometry_error(positions)
-            loss = config.trajectory_weight * geometry / problem.size + config.silhouette_weight * silhouette
+            loss = config.trajectory_weight * geometry / problem.size
+            loss = loss + picture_objective(problem, (outline, paint))
             if isinstance(law, NeuralLaw) and isinstance(start, NeuralLaw) and config.prior_weight:
                 loss = loss + config.prior_weight * law.departure(start)
             if frames == problem.frames:
@@ -108,7 +110,7 @@ def fit(
             continue
         failures, caution, reach = 0, min(1.0, RECOVERY * caution), min(problem.frames, reach + 1)
         accepted = [p.detach().clone() for p in parameters]
-        best.history.append((i, frames, float(error.detach()), float(silhouette.detach())))
+        best.history.append((i, frames, float(error.detach()), float(outline.detach())))
         for group in optimiser.param_groups:
             torch.nn.utils.clip_grad_norm_(group["params"], 1.0)
         optimiser.step()
@@ -125,22 +127,11 @@ def fit(
 
 def _keep_better(best: Fit, problem: Problem, positions: torch.Tensor, law: NeuralLaw | AdapterLaw, motion: Motion):
     """Put law and throw into ``best`` where their ``positions`` over all frames are nearer to what was observed."""
-    here = _objective(problem, positions)
+    here = objective(problem, positions)
     if here < best.objective:
         best.objective, best.error_m = here, float(problem.error(positions.detach()))
         best.law = copy.deepcopy(law)
         best.motion = Motion(*(t.detach().clone() for t in motion.tensors()))
-
-
-@torch.no_grad()
-def _objective(problem: Problem, positions: torch.Tensor) -> float:
-    """What is made small, at ``positions`` over all frames, with the same pictures each time."""
-    config = problem.config
-    value = config.trajectory_weight * problem.geometry_error(positions) / problem.size
-    if problem.scene.views and config.silhouette_pictures and config.silhouette_weight:
-        shown = some_of_each(problem, problem.frames)
-        value = value + config.silhouette_weight * silhouette_errors(problem, positions, shown)
-    return float(value)
 
 
 def _horizon(iteration: int, iterations: int, first: int, last: int) -> int:
@@ -148,17 +139,18 @@ def _horizon(iteration: int, iterations: int, first: int, last: int) -> int:
     return min(last, max(1, round(grown)))
 
 
-def _silhouette(problem: Problem, positions: torch.Tensor, frames: int, seed: int, iteration: int) -> torch.Tensor:
-    """Mean silhouette error of a few pictures drawn from (seed, iteration)."""
-    config, scene = problem.config, problem.scene
-    if config.silhouette_pictures == 0 or config.silhouette_weight == 0:
-        return torch.zeros(())
+def _pictures(
+    problem: Problem, positions: torch.Tensor, frames: int, seed: int, iteration: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean errors of silhouettes and paint in a few pictures drawn from (seed, iteration)."""
+    if not compared(problem):
+        return torch.zeros(()), torch.zeros(())
     random = np.random.default_rng((seed, iteration))
     pictures = []
-    for _ in range(config.silhouette_pictures):
+    for _ in range(problem.config.pictures):
         frame = int(random.integers(1, frames + 1))
-        pictures.append((frame, int(random.choice(scene.views))))
-    return silhouette_errors(problem, positions, pictures)
+        pictures.append((frame, int(random.choice(problem.scene.views))))
+    return picture_errors(problem, positions, pictures)
 
 
 def fit_state(found: Fit) -> dict:

@@ -10,8 +10,8 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.identify.fit import Fit, fit
+from masiv.identify.pictures import picture_errors, picture_objective, some_of_each
 from masiv.identify.problem import Problem
-from masiv.identify.silhouette import silhouette_errors, some_of_each
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
 
@@ -22,7 +22,7 @@ VIEWS = 3
 def wanted(problem: Problem) -> bool:
     """Whether surfaces have the last word: a fit to paths that has silhouettes to be judged by."""
     config = problem.config
-    judged = bool(problem.scene.views) and config.silhouette_weight > 0 and config.silhouette_pictures > 0
+    judged = bool(problem.scene.views) and config.silhouette_weight > 0 and config.pictures > 0
     return config.polish and config.geometry_loss == "trajectory" and judged
 
 
@@ -45,12 +45,16 @@ def polish(
         progress=lambda _, *rest: progress("identify: fit surfaces", *rest),
     )  # fmt: skip
     other.history = [*fitted.history, *((i + problem.config.iterations, *rest) for i, *rest in other.history)]
-    before, after = (_silhouettes(problem, f, contact) for f in (fitted, other))
-    report = {"silhouette_error_of_paths": before, "silhouette_error_of_surfaces": after}
+    seen = {name: _seen(surfaces, f, contact) for name, f in (("paths", fitted), ("surfaces", other))}
+    report = {f"silhouette_error_of_{name}": float(errors[0]) for name, errors in seen.items()}
+    if problem.paint is not None:
+        report |= {f"paint_error_of_{name}": float(errors[1]) for name, errors in seen.items()}
+    before, after = (float(picture_objective(surfaces, errors)) for errors in seen.values())
     return (other if after < before else fitted), report
 
 
 @torch.no_grad()
-def _silhouettes(problem: Problem, fitted: Fit, contact: str) -> float:
+def _seen(problem: Problem, fitted: Fit, contact: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Errors of silhouettes and paint."""
     positions = problem.run(fitted.law, fitted.motion, contact, problem.frames)
-    return float(silhouette_errors(problem, positions, some_of_each(problem, problem.frames, VIEWS)))
+    return picture_errors(problem, positions, some_of_each(problem, problem.frames, VIEWS))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -24,6 +25,9 @@ from masiv.mpm.simulator import Simulator
 from masiv.scene.scene import Ground, Scene
 from masiv.scene.transforms import SimulationFrame
 from masiv.twin import TwinEffect
+
+if TYPE_CHECKING:
+    from masiv.identify.paint import Paint
 
 
 @dataclass
@@ -100,19 +104,31 @@ class Problem:
         self.known = ActiveEffects(members, self.setting()) if members else None
 
     def of_surfaces(self, iterations: int) -> Problem:
-        """The same with ``iterations``, the loss "surface" and more weight of the silhouettes."""
-        changes = {"silhouette_weight": self.config.polish_silhouette_weight, "iterations": iterations}
+        """The same with ``iterations``, the loss "surface" and more weight of the pictures."""
+        c = self.config
+        weights = {"silhouette_weight": c.polish_silhouette_weight, "paint_weight": c.polish_paint_weight}
         other = copy.copy(self)
-        other.config = self.config.model_copy(update={"geometry_loss": "surface", **changes})
+        other.config = c.model_copy(update={"geometry_loss": "surface", "iterations": iterations, **weights})
         other.surface = torch.from_numpy(np.flatnonzero(surface_points(self.start.numpy())))
         return other
 
     @functools.cached_property
     def blob_size(self) -> float:
-        """See ``masiv.identify.silhouette.blob_size``; [m]."""
-        from masiv.identify.silhouette import blob_size
+        """See ``masiv.identify.pictures.blob_size``; [m]."""
+        from masiv.identify.pictures import blob_size
 
         return blob_size(self)
+
+    @functools.cached_property
+    def paint(self) -> Paint | None:
+        """The particles' paint, None where no weight is given to it."""
+        from masiv.identify.paint import paint
+
+        return (
+            paint(self)
+            if self.scene.views and max(self.config.paint_weight, self.config.polish_paint_weight) > 0
+            else None
+        )
 
     def substeps(self, law: Law) -> int:
         """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number."""

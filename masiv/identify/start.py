@@ -14,8 +14,8 @@ import torch
 from scipy.optimize import minimize
 
 from masiv.errors import MasivError, NonFiniteError
+from masiv.identify.objective import discrepancy
 from masiv.identify.problem import Motion, Problem
-from masiv.identify.silhouette import discrepancy
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
 from masiv.materials.pretrain import MATERIALS, pretrained_path
