@@ -332,11 +332,37 @@ def test_departure_counts_every_strain_and_no_scale():
     with torch.no_grad():
         scaled.log_stress_scale += 2.0
         scaled.log_flow_strain -= 1.0
+        scaled.log_bulk_ratio += 0.5
+        scaled.log_flow_rate += 0.5
         other.elastic[-1].bias[2] += 0.5  # a bulk modulus e^0.5 times as large, at all strains
     assert float(law.departure(law)) == float(scaled.departure(law)) == 0.0
     assert float(other.departure(law)) == pytest.approx(0.5**2 / 4)
     (slope,) = torch.autograd.grad(other.departure(law), other.elastic[-1].bias)
     torch.testing.assert_close(slope, torch.tensor([0.0, 0.0, 0.25, 0.0], dtype=torch.float64))
+
+
+def test_each_scale_of_a_neural_law_moves_what_it_is_named_after():
+    """Factors of e: shear and bulk moduli, the isochoric and the volumetric rate, by the strain features at hand."""
+    law = NeuralLaw(seed=3).double()
+    factors = {"log_stress_scale": (1, 1, 0, 0), "log_bulk_ratio": (0, 1, 0, 0), "log_flow_rate": (0, 0, 1, 0)}
+    for name, expected in factors.items():
+        moved = copy.deepcopy(law)
+        with torch.no_grad():
+            getattr(moved, name).add_(1.0)
+        moduli = (moved.moduli_table() - law.moduli_table())[:, [0, 2]]
+        # Rates are within e^-14 to e^14 per second, nearly linear where they are small.
+        rates = moved.rate_table() - law.rate_table()
+        for column, value in zip((*moduli.T, *rates.T), expected, strict=True):
+            torch.testing.assert_close(column, torch.full_like(column, value), atol=0.05, rtol=0.0)
+
+
+def test_a_law_from_before_it_had_a_bulk_ratio_is_read():
+    law = NeuralLaw(seed=3)
+    old = {name: value for name, value in law.state_dict().items() if name not in ("log_bulk_ratio", "log_flow_rate")}
+    read = NeuralLaw(seed=4)
+    read.load_state_dict(old)
+    torch.testing.assert_close(read.moduli_table(), law.moduli_table())
+    torch.testing.assert_close(read.rate_table(), law.rate_table())
 
 
 def test_laws_survive_saving(tmp_path):

@@ -159,7 +159,7 @@ def test_the_adjoint_of_a_yielding_body_does_not_grow():
     axis = 0.4 * (torch.arange(7) + 0.5) / 7
     x = torch.stack(torch.meshgrid(axis, axis + 0.05, axis, indexing="ij"), -1).reshape(-1, 3)
     velocity = torch.tensor([0.3, -3.0, 0.0], requires_grad=True)
-    soft = with_scales(law, 5e4, 1.0)
+    soft = with_scales(law, 5e4)
     path = rollout(sim, soft, at_rest(x, velocity.expand(343, 3), torch.zeros(343, 3, 3)), 400, [400])[0]
     (gradient,) = torch.autograd.grad(path.mean(0)[0], [velocity])
     duration = 400 * 6e-4

@@ -58,7 +58,7 @@ def fit(
     start, law = prior or law, copy.deepcopy(law)
     motion = Motion(*(t.detach().clone().requires_grad_() for t in motion.tensors()))
     if isinstance(law, NeuralLaw):
-        scales = [law.log_stress_scale, law.log_flow_strain]
+        scales = law.scales()
         weights = [*law.elastic.parameters(), *law.plastic.parameters()]
     else:
         scales, weights = [], [p for p in law.parameters() if p.requires_grad]

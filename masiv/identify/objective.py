@@ -17,12 +17,3 @@ def objective(problem: Problem, positions: torch.Tensor) -> float:
         shown = picture_errors(problem, positions, some_of_each(problem, problem.frames))
         value = value + picture_objective(problem, shown)
     return float(value)
-
-
-@torch.no_grad()
-def discrepancy(problem: Problem, positions: torch.Tensor) -> float:
-    """What starts are compared by: the geometrical objective [m], or, without one, the silhouettes [1]."""
-    if problem.config.geometry_loss == "none":
-        frames = len(positions) // problem.samples
-        return float(picture_errors(problem, positions, some_of_each(problem, frames))[0])
-    return float(problem.geometry_error(positions))

@@ -8,20 +8,19 @@ Light falls otherwise on a body that turns and spreads, so pictures are compared
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 
-from masiv.identify.pictures import OPACITY, Window, drawn, to_world, window
+from masiv.identify.pictures import Window, drawn, to_world, window
 from masiv.identify.problem import Problem
-from masiv.splat.rasteriser import project
 
 SWEEPS = 12
 BRUSH = 0.5
 """Standard deviation of a particle's blob, in particle spacings: what is behind others must not show between them."""
-SEEN = 0.05
-"""A particle is known where the pictures of frame 0 show this share of its blobs: in a ball, the outermost layer."""
+SEEN = 0.2
+"""A particle is known where the pictures of frame 0 show this share of what they show of the best seen ones (of the
+95th of 100): in a ball, the outermost layer."""
 SHOWN = 0.2
 """A pixel counts where known particles make up this share of it."""
 PLAIN = 0.03
@@ -50,7 +49,7 @@ def paint(problem: Problem) -> Paint:
     points = to_world(problem, problem.start)
     windows = [window(problem.scene, view, 0) for view in problem.scene.views]
     colours = torch.full((count, 3), 0.5, requires_grad=True)
-    weight, whole = torch.zeros(count), torch.zeros(count)
+    weight = torch.zeros(count)
     for sweep in range(SWEEPS):
         missing = torch.zeros(count, 3)
         for seen in windows:
@@ -58,16 +57,14 @@ def paint(problem: Problem) -> Paint:
             inside = (seen.mask * seen.valid)[..., None]
             if sweep == 0:
                 weight += torch.autograd.grad((picture.rgb * inside).sum(), colours, retain_graph=True)[0][:, 0]
-                xx, xy, yy = project(seen.camera, points, torch.full((count,), size))[1].unbind(1)
-                whole += 2 * math.pi * OPACITY * (xx * yy - xy * xy).sqrt()
             full = picture.rgb / picture.alpha.clamp_min(SHOWN)[..., None]
             residual = ((seen.image - full) * inside).detach()
             missing += torch.autograd.grad((picture.rgb * residual).sum(), colours)[0]
         with torch.no_grad():
-            colours += missing / weight.clamp_min(SEEN)[:, None]
+            colours += missing / weight.clamp_min(1e-3)[:, None]
             colours.clamp_(0, 1)
-    found, known = colours.detach(), weight >= SEEN * whole
-    if known.sum() < 3:
+    found, known = colours.detach(), weight >= SEEN * weight.quantile(0.95)
+    if weight.max() == 0 or known.sum() < 3:
         return Paint(torch.zeros(count, 3), torch.zeros(3), torch.zeros(3, 2), size)
     mean = found[known].mean(0)
     axes = torch.linalg.svd(found[known] - mean, full_matrices=False).Vh[:2].T

@@ -159,11 +159,7 @@ def _neural(
             problem, fitted, start.contact, start.law, seed=seed, checkpoint=keeper, progress=progress
         )  # fmt: skip
         report |= seen
-    report |= (
-        {"start_silhouette": start.error}
-        if report["geometry_loss"] == "none"
-        else {"start_error_mm": 1e3 * start.error}
-    )
+    report["start_objective"] = start.error
     return Found(fitted.law, fitted.motion, start.contact, fitted.error_m, report, history_rows(fitted))
 
 

@@ -1,5 +1,4 @@
-"""Where the fit starts: the pretrained law, contact, stiffness and yield strain whose rollout is nearest to the
-motion."""
+"""Where the fit starts: the pretrained law, contact and scales whose rollout is nearest to what was observed."""
 
 from __future__ import annotations
 
@@ -13,8 +12,9 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from masiv.errors import MasivError, NonFiniteError
-from masiv.identify.objective import discrepancy
+from masiv.errors import InputError, MasivError
+from masiv.identify.objective import objective
+from masiv.identify.pictures import compared
 from masiv.identify.problem import Motion, Problem
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
@@ -25,6 +25,8 @@ from masiv.workers import Workers, demanded
 MODULI = (3e3, 1e4, 3e4, 1e5, 3e5)
 """P-wave moduli tried [Pa at 1000 kg/m^3]: waves of 1.7 to 17 m/s, from what sags at once to what hardly deforms in a
 throw."""
+STEPS = (0.5, 1.0, 0.7, 0.7)
+"""First steps of the simplex search in the logarithms of ``NeuralLaw.scales``; what is elastic has the first two."""
 DIVERGED = 1e3
 ELASTIC = "jelly"
 TELLS = 1.1
@@ -34,7 +36,7 @@ the motion does not reach would be invented: the body breaks there as soon as a 
 
 @dataclass(frozen=True)
 class Start:
-    """A law to start from; error: ``discrepancy`` of its rollout with few particles, [m] or, of silhouettes, [1]."""
+    """A law to start from; error: ``objective`` of its rollout with few particles."""
 
     material: str
     contact: str
@@ -42,18 +44,19 @@ class Start:
     error: float
 
 
-def with_scales(law: NeuralLaw, modulus: float, flow_factor: float) -> NeuralLaw:
-    """``law`` with another P-wave modulus [Pa] and its flow strain times ``flow_factor``."""
+def with_scales(law: NeuralLaw, modulus: float, logs: Sequence[float] = ()) -> NeuralLaw:
+    """``law`` with another P-wave modulus [Pa]; then its scales (``NeuralLaw.scales``) times exp(``logs``)."""
     scaled = copy.deepcopy(law)
     with torch.no_grad():
         scaled.log_stress_scale += math.log(modulus / scaled.wave_modulus())
-        scaled.log_flow_strain += math.log(flow_factor)
+        for scale, log in zip(scaled.scales(), logs, strict=False):
+            scale += log
     return scaled
 
 
 def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: Workers | None = None) -> list[Start]:
-    """Candidates, best first: each material at each of ``MODULI``, then simplex search over stiffness and flow strain;
-    the elastic one counts as the better where another is hardly nearer (``TELLS``).
+    """Candidates, best first: each material at each of ``MODULI``, then simplex search over the scales of two; the
+    elastic one counts as the better where another is hardly nearer (``TELLS``).
 
     problem: with few particles. Rollouts run side by side in ``workers``, and give the same to the bit in whichever.
     Raises MasivError where every candidate diverges.
@@ -66,12 +69,12 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: 
     density = problem.scene.density / 1000
     tried = [(name, contact, modulus * density) for name in materials for contact in contacts for modulus in MODULI]
     coarse: list[tuple[float, str, str, float]] = []
-    if config.geometry_loss == "none":
-        _ = problem.blob_size  # found here once, or each process would find its own
-    found = workers.map(_error, [(problem, motion, *candidate, 1.0) for candidate in tried])
+    if compared(problem):
+        _ = problem.blob_size, problem.paint  # found here once, or each process would find its own
+    found = workers.map(_error, [(problem, motion, *candidate) for candidate in tried])
     for (name, contact, modulus), error in zip(tried, map(demanded, found), strict=True):
         coarse.append((error, name, contact, modulus))
-        progress("identify: start", len(coarse), len(tried), f"{name}, {contact}: {said(problem, error)}")
+        progress("identify: start", len(coarse), len(tried), f"{name}, {contact}: {said(error)}")
     best = {}
     for error, name, contact, modulus in sorted(coarse):
         best.setdefault(name, (error, contact, modulus))
@@ -80,9 +83,10 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: 
     ranked = sorted(best, key=lambda name: best[name][0])[:2]
     starts = []
     searched = workers.map(_searched, [(problem, motion, name, *best[name]) for name in ranked])
-    for done, (name, (modulus, flow, error)) in enumerate(zip(ranked, map(demanded, searched), strict=True)):
-        starts.append(Start(name, best[name][1], with_scales(_pretrained(name), modulus, flow), error))
-        progress("identify: start", done + 1, len(ranked), f"{name}: {said(problem, starts[-1].error)}")
+    for done, (name, (logs, error)) in enumerate(zip(ranked, map(demanded, searched), strict=True)):
+        _, contact, modulus = best[name]
+        starts.append(Start(name, contact, with_scales(_pretrained(name), modulus, logs), error))
+        progress("identify: start", done + 1, len(ranked), f"{name}: {said(starts[-1].error)}")
     return best_first(starts)
 
 
@@ -91,30 +95,30 @@ def best_first(starts: Sequence[Start]) -> list[Start]:
     return sorted(starts, key=lambda start: start.error * (1.0 if start.material == ELASTIC else TELLS))
 
 
-def said(problem: Problem, error: float) -> str:
+def said(error: float) -> str:
     """An error for people."""
-    if error >= DIVERGED:
-        return "diverges"
-    return f"silhouettes {error:.3f}" if problem.config.geometry_loss == "none" else f"{1e3 * error:.1f} mm"
+    return "diverges" if error >= DIVERGED else f"objective {error:.3f}"
 
 
 def _searched(
     problem: Problem, motion: Motion, name: str, error: float, contact: str, modulus: float
-) -> tuple[float, float, float]:
-    """P-wave modulus [Pa], factor of the flow strain and error after a simplex search from a candidate."""
+) -> tuple[list[float], float]:
+    """Logarithms of factors of the scales, and the error, after a simplex search from a candidate."""
+    steps = STEPS[:2] if name == ELASTIC else STEPS
 
-    def objective(logs: np.ndarray) -> float:
-        if not logs.any():
-            return error
-        return _error(problem, motion, name, contact, modulus * math.exp(logs[0]), math.exp(logs[1]))
+    def searched(logs: np.ndarray) -> float:
+        return _error(problem, motion, name, contact, modulus, tuple(logs)) if logs.any() else error
 
     found = minimize(
-        objective,
-        np.zeros(2),
+        searched,
+        np.zeros(len(steps)),
         method="Nelder-Mead",
-        options={"initial_simplex": [[0, 0], [0.5, 0], [0, 0.7]], "maxfev": 24, "xatol": 0.02, "fatol": 1e-4},
-    )
-    return modulus * math.exp(found.x[0]), math.exp(found.x[1]), float(found.fun)
+        options={
+            "initial_simplex": np.vstack([np.zeros(len(steps)), np.diag(steps)]), "maxfev": 12 * len(steps),
+            "xatol": 0.02, "fatol": 1e-4,
+        },
+    )  # fmt: skip
+    return [float(log) for log in found.x], float(found.fun)
 
 
 @functools.lru_cache
@@ -123,9 +127,13 @@ def _pretrained(name: str) -> NeuralLaw:
 
 
 @torch.no_grad()
-def _error(problem: Problem, motion: Motion, name: str, contact: str, modulus: float, flow: float) -> float:
-    scaled = with_scales(_pretrained(name), modulus, flow)
+def _error(
+    problem: Problem, motion: Motion, name: str, contact: str, modulus: float, logs: tuple[float, ...] = ()
+) -> float:
+    scaled = with_scales(_pretrained(name), modulus, logs)
     try:
-        return discrepancy(problem, problem.run(scaled, motion, contact, problem.frames))
-    except NonFiniteError:
+        return objective(problem, problem.run(scaled, motion, contact, problem.frames))
+    except InputError:
+        raise
+    except MasivError:  # it diverges, or is too stiff for any substep
         return DIVERGED

@@ -94,7 +94,7 @@ def perturbed(law: Law, factor: float = STEP) -> dict[str, Law]:
     if isinstance(law, NeuralLaw):
         return {
             "shear modulus": _nudged(law, lambda new: new.elastic[-1].bias[:2].add_(math.log(factor))),
-            "bulk modulus": _nudged(law, lambda new: new.elastic[-1].bias[2:3].add_(math.log(factor))),
+            "bulk modulus": _nudged(law, lambda new: new.log_bulk_ratio.add_(math.log(factor))),
             "flow strain": _nudged(law, lambda new: new.log_flow_strain.add_(math.log(factor))),
             "relaxation time": _nudged(law, lambda new: new.plastic[-1].bias.sub_(math.log(factor))),
         }

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -46,13 +47,13 @@ def strain_invariants(deformation_gradient: torch.Tensor) -> torch.Tensor:
 
 
 class NeuralLaw(Law):
-    """Two networks 3 -> width -> width -> coefficients, and two scales learnt as logarithms.
+    """Two networks 3 -> width -> width -> coefficients, and four scales learnt as logarithms.
 
     The networks are known by their values on a lattice of strain features, between whose nodes the law is interpolated.
 
     The elastic network gives log moduli relative to the stress scale [Pa], the plastic one log relaxation rates [1/s]
-    of strains relative to the flow strain: moving the two scales makes another stiffness and another yield strain of
-    one kind.
+    of strains relative to the flow strain. Moving the scales makes another material of one kind: its stiffness, its
+    resistance to compression over that to shear, its yield strain, and how fast it flows.
     """
 
     kind = "neural"
@@ -65,6 +66,12 @@ class NeuralLaw(Law):
         self.plastic = _network(width, 2, generator)
         self.log_stress_scale = torch.nn.Parameter(torch.tensor(math.log(stress_scale)))
         self.log_flow_strain = torch.nn.Parameter(torch.tensor(math.log(STRAIN_SCALE)))
+        self.log_bulk_ratio = torch.nn.Parameter(torch.tensor(0.0))
+        self.log_flow_rate = torch.nn.Parameter(torch.tensor(0.0))
+
+    def scales(self) -> list[torch.nn.Parameter]:
+        """Logarithms of stress scale, bulk ratio, flow strain and rate of the isochoric flow, each ()."""
+        return [self.log_stress_scale, self.log_bulk_ratio, self.log_flow_strain, self.log_flow_rate]
 
     @staticmethod
     def features(invariants: torch.Tensor, strain: torch.Tensor | float) -> torch.Tensor:
@@ -81,13 +88,17 @@ class NeuralLaw(Law):
     def moduli_table(self) -> torch.Tensor:
         """ln g1, ln g2, ln kappa and coupling [Pa] at the nodes of ``masiv.materials.table``, (K, 4)."""
         raw = self.elastic(table.nodes(self.log_stress_scale.dtype))
-        bounded = LOG_MODULUS_RANGE * torch.tanh(raw[:, :3] / LOG_MODULUS_RANGE)
+        shear, bulk = (LOG_MODULUS_RANGE * torch.tanh(part / LOG_MODULUS_RANGE) for part in raw[:, :3].split((2, 1), 1))
         coupling = torch.exp(self.log_stress_scale) * torch.tanh(raw[:, 3:])
-        return torch.cat([self.log_stress_scale + bounded, coupling], dim=1)
+        moduli = torch.cat([shear, bulk + self.log_bulk_ratio], dim=1)
+        return torch.cat([self.log_stress_scale + moduli, coupling], dim=1)
 
     def rate_table(self) -> torch.Tensor:
         """Logarithms of the isochoric and volumetric relaxation rate [1/s] at the nodes, (K, 2)."""
-        return LOG_RATE_RANGE * torch.tanh(self.plastic(table.nodes(self.log_stress_scale.dtype)) / LOG_RATE_RANGE)
+        raw = self.plastic(table.nodes(self.log_stress_scale.dtype))
+        isochoric, volumetric = raw.split(1, dim=1)
+        moved = torch.cat([isochoric + self.log_flow_rate, volumetric], dim=1)
+        return LOG_RATE_RANGE * torch.tanh(moved / LOG_RATE_RANGE)
 
     def flow_table(self, dt: float) -> torch.Tensor:
         """-ln of the shares of isochoric and volumetric strain that a substep of dt [s] keeps, at the nodes, (K, 2)."""
@@ -124,7 +135,7 @@ class NeuralLaw(Law):
 
     def departure(self, other: NeuralLaw) -> torch.Tensor:
         """Mean square difference () of the networks' outputs (log moduli relative to the stress scale, coupling, log
-        rates) from those of ``other`` over the lattice of strain features; the two scales do not count."""
+        rates) from those of ``other`` over the lattice of strain features; the scales do not count."""
         nodes = table.nodes(self.log_stress_scale.dtype)[::EVERY]
         with torch.no_grad():
             were = other.elastic(nodes), other.plastic(nodes)
@@ -150,6 +161,11 @@ class NeuralLaw(Law):
                 "bulk_modulus_at_rest": {"value": kappa, "unit": "Pa"},
             },
         }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """Of a law that was written before it had a bulk ratio and a flow rate, too: both were 1."""
+        ones = {name: torch.zeros(()) for name in ("log_bulk_ratio", "log_flow_rate")}
+        return super().load_state_dict({**ones, **state_dict}, strict, assign)
 
     def file_metadata(self) -> dict[str, str]:
         return {"kind": self.kind, "width": str(self.width)}
