@@ -29,8 +29,9 @@ pytestmark = pytest.mark.usefixtures("taichi")
 
 KNOWN, FRAMES, SIZE, CENTRE, HIDDEN_VIEW = 3, 6, 0.016, np.array([0.0, 0.5, 0.0]), 3
 CONFIG = ReconstructConfig(
-    gaussians=250, hull_resolution=20, crop_side=40, crop_padding=4, width=16, depth=1, space_octaves=1, iterations=120
-)
+    gaussians=250, hull_resolution=20, crop_side=40, crop_padding=4, width=16, depth=1, space_octaves=1, iterations=120,
+    processes=1,
+)  # fmt: skip
 FOLLOW = FollowConfig(effort=1.0, relearn_steps=150)
 TRAJECTORY = TrajectoryConfig(fill_resolution=28, iterations=60, batch=300)
 

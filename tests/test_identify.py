@@ -102,7 +102,7 @@ def test_flight_ends_where_the_body_hits_what_nobody_declared(body):
 
 
 def settings(**changes):
-    fast = dict(start="jelly", contact="sticky", iterations=14, pictures=0, search_particles=200)
+    fast = dict(processes=1, start="jelly", contact="sticky", iterations=14, pictures=0, search_particles=200)
     return IdentifyConfig(**(fast | changes))
 
 

@@ -37,6 +37,7 @@ CONFIG = ReconstructConfig(
     iterations=260,
     first_frame_share=0.4,
     growth_share=0.3,
+    processes=1,
 )
 
 

@@ -42,6 +42,9 @@ def identify(
 
     With ``config.law`` neural nothing is assumed of the material: the pretrained law whose rollout is nearest to the
     motion is only the start. Otherwise the law is a classical one, or an adapter on one.
+
+    Where ``config.processes`` lets several processes look for that start, ``scene`` must be picklable, and a script
+    needs ``if __name__ == "__main__":`` around what it does.
     """
     with runtime.torch_threads(1):
         return _identify(scene, trajectory, config, simulator, seed, checkpoint or Checkpoint(None), progress)
