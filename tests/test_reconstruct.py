@@ -16,7 +16,7 @@ from masiv.splat._reference import _render
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
-from masiv.splat.losses import ssim, strain
+from masiv.splat.losses import neighbour_pairs, ssim, strain
 from masiv.splat.objective import NAMES, Objective, Part
 from masiv.splat.observe import observe
 from masiv.splat.rasteriser import render
@@ -309,3 +309,15 @@ def test_ssim_and_strain_have_their_known_values():
     turn = torch.linalg.matrix_exp(torch.tensor([[0, 1.0, 0.2], [-1, 0, 0.5], [-0.2, -0.5, 0]]).double())
     assert float(strain(rest, rest @ turn.T + 3 - rest, *pairs, softening=0.0)) < 1e-10
     assert float(strain(rest, 0.1 * rest, *pairs, softening=0.0)) == pytest.approx(0.01, rel=1e-6)
+
+
+def test_a_pair_of_neighbours_counts_for_each_of_the_two():
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(2))
+    moved = torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(3))
+    first, second, times = neighbour_pairs(points.double().numpy(), 6)
+    assert (first < second).all()
+    assert float(times.sum()) == 300
+    nearest = torch.cdist(points, points).argsort(1)[:, 1:7]
+    apart = torch.arange(50).repeat_interleave(6), nearest.flatten()
+    one, other = (strain(points, moved, *p, softening=0.1) for p in ((first, second, times), apart))
+    assert float(one) == pytest.approx(float(other), rel=1e-5)

@@ -86,8 +86,7 @@ class _Following:
 
         means = dynamic.canonical.means.detach()
         self.gaussians = _parameters(dynamic.canonical)
-        first, second = neighbour_pairs(means.double().numpy(), config.neighbours)
-        self.pairs = torch.from_numpy(first), torch.from_numpy(second)
+        self.pairs = neighbour_pairs(means.double().numpy(), config.neighbours)
         self.half_extent = known.settings["half_extent"]
         pulls = {frame: HullPull(hull) for frame, hull in zip(new, hulls[1:], strict=True)}
         scale = float(dynamic.canonical.scales.mean())

@@ -37,25 +37,40 @@ def _blur(size: int, dtype: torch.dtype) -> torch.Tensor:
     return (weights / weights.sum(1, keepdim=True)).to(dtype)
 
 
-def neighbour_pairs(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Each point's ``count`` nearest others: indices of both ends, two (P,) int64. points (N, 3)."""
+Pairs = tuple[torch.Tensor, ...]
+"""As ``neighbour_pairs`` gives them, or their two ends alone."""
+
+
+def neighbour_pairs(points: np.ndarray, count: int) -> Pairs:
+    """Each point and its ``count`` nearest others, as pairs: both ends, two (P,) int64, and how many of the two have
+    the other as a neighbour, (P,) float32. Most have each other, and a stretch is the same from both ends."""
     count = min(count, len(points) - 1)
     found = cKDTree(points).query(points, k=count + 1)[1][:, 1:]
-    return np.repeat(np.arange(len(points)), count), found.ravel().astype(np.int64)
+    ends = np.sort(np.stack([np.repeat(np.arange(len(points)), count), found.ravel()], axis=1), axis=1)
+    ends, times = np.unique(ends, axis=0, return_counts=True)
+    first, second = (torch.from_numpy(np.ascontiguousarray(end, dtype=np.int64)) for end in ends.T)
+    return first, second, torch.from_numpy(times.astype(np.float32))
 
 
 def strain(
-    rest: torch.Tensor, displacement: torch.Tensor, first: torch.Tensor, second: torch.Tensor, softening: float
+    rest: torch.Tensor,
+    displacement: torch.Tensor,
+    first: torch.Tensor,
+    second: torch.Tensor,
+    times: torch.Tensor | None = None,
+    *,
+    softening: float,
 ) -> torch.Tensor:
     """Mean squared relative change of length between neighbours, a scalar: 0 for a rigid motion.
 
-    rest (N, 3), displacement (..., N, 3) [m]; first, second (P,) ends of the pairs; softening [m] is added to the rest
-    length, so that two Gaussians that nearly coincide do not rule the sum.
+    rest (N, 3), displacement (..., N, 3) [m]; first, second (P,) ends of the pairs, which count ``times`` (once where
+    None); softening [m] is added to the rest length, so that two Gaussians that nearly coincide do not rule the sum.
     """
     before = rest[second] - rest[first]
     after = before + displacement[..., second, :] - displacement[..., first, :]
     length = _length(before)
-    return ((_length(after) - length) / (length + softening)).square().mean()
+    squares = ((_length(after) - length) / (length + softening)).square()
+    return squares.mean() if times is None else (squares * (times / times.mean())).mean()
 
 
 def _length(vectors: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,7 @@ import torch
 from masiv.scene.scene import Ground
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
-from masiv.splat.losses import ssim, strain
+from masiv.splat.losses import Pairs, ssim, strain
 from masiv.splat.observe import Observation
 from masiv.splat.pull import HullPull
 from masiv.splat.rasteriser import render
@@ -54,7 +54,7 @@ class Objective:
         self,
         gaussians: dict[str, torch.Tensor],
         network: DeformationNetwork,
-        pairs: tuple[torch.Tensor, torch.Tensor],
+        pairs: Pairs,
         pictures: list[tuple[int, int]],
         pull: float,
         rng: np.random.Generator,
@@ -92,7 +92,7 @@ class Objective:
         self,
         gaussians: dict[str, torch.Tensor],
         network: DeformationNetwork,
-        pairs: tuple[torch.Tensor, torch.Tensor],
+        pairs: Pairs,
         part: Part,
     ) -> torch.Tensor:
         """The loss of ``part``, a scalar.
@@ -123,7 +123,7 @@ class Objective:
         means: torch.Tensor,
         displacements: torch.Tensor,
         frames: list[int],
-        pairs: tuple[torch.Tensor, torch.Tensor],
+        pairs: Pairs,
         part: Part,
     ) -> torch.Tensor:
         """Strain between neighbours, depth below the ground, distance from the last frame's hull."""

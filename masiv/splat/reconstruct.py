@@ -101,7 +101,7 @@ class _Fit:
         self.network.load_state_dict(state["network"])
         self._start_optimiser()
         self.optimiser.load_state_dict(state["optimiser"])
-        self.pairs = state["pairs"][0], state["pairs"][1]
+        self.pairs = tuple(state["pairs"])
 
     def state(self) -> dict[str, Any]:
         """All that a resumed fit needs, as tensors and plain values."""
@@ -142,8 +142,7 @@ class _Fit:
 
     def _find_neighbours(self) -> None:
         means = self.parameters["means"].detach().double().numpy()
-        first, second = neighbour_pairs(means, self.config.neighbours)
-        self.pairs = torch.from_numpy(first), torch.from_numpy(second)
+        self.pairs = neighbour_pairs(means, self.config.neighbours)
 
     @property
     def frames(self) -> int:

@@ -20,10 +20,10 @@ import torch
 from masiv import runtime
 from masiv.errors import MasivError
 from masiv.splat.deformation import DeformationNetwork
+from masiv.splat.losses import Pairs
 from masiv.splat.objective import NAMES, Objective, Part
 from masiv.workers import ONE_THREAD, attempt, demanded
 
-Pairs = tuple[torch.Tensor, torch.Tensor]
 Slopes = Sequence[torch.Tensor | None]
 CLOSING_S = 10.0
 
@@ -134,7 +134,7 @@ class _Server:
     def __init__(self, file: int, objective: Objective, network: DeformationNetwork, size: int) -> None:
         self.objective, self.network = objective, network
         self.parameters, self.slopes = _mapped(file, size)
-        self.pairs: Pairs = (torch.empty(0), torch.empty(0))
+        self.pairs: Pairs = ()
 
     def compute(self, part: Part, count: int, pairs: Pairs | None) -> tuple[float, list[bool]]:
         """The loss, and which parameters it depends on; their gradients are written to the common memory."""
