@@ -93,7 +93,7 @@ def test_as_many_as_asked_or_as_there_are_cores():
 def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.identify.start.MODULI", (1e4, 3e4))
     motion = observed({})
-    motion = SampledMotion(motion.positions[:4], motion.times[:4], motion.volume)
+    motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
     problem = Problem(scene(), motion, config, SimulatorConfig(), particles=150, seed=0)
     throw = Motion.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))

@@ -67,14 +67,16 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: 
     if problem.scene.ground is None:
         contacts = ["none"]
     density = problem.scene.density / 1000
-    tried = [(name, contact, modulus * density) for name in materials for contact in contacts for modulus in MODULI]
+    moduli = [modulus * density for modulus in MODULI]
+    kinds = [(name, contact) for name in materials for contact in contacts]
     coarse: list[tuple[float, str, str, float]] = []
     if compared(problem):
         _ = problem.blob_size, problem.paint  # found here once, or each process would find its own
-    found = workers.map(_error, [(problem, motion, *candidate) for candidate in tried])
-    for (name, contact, modulus), error in zip(tried, map(demanded, found), strict=True):
-        coarse.append((error, name, contact, modulus))
-        progress("identify: start", len(coarse), len(tried), f"{name}, {contact}: {said(error)}")
+    found = workers.map(_errors, [(problem, motion, *kind, moduli) for kind in kinds])
+    for (name, contact), errors in zip(kinds, map(demanded, found), strict=True):
+        coarse += [(error, name, contact, modulus) for error, modulus in zip(errors, moduli, strict=True)]
+        total = len(kinds) * len(moduli)
+        progress("identify: start", len(coarse), total, f"{name}, {contact}: {said(min(errors))}")
     best = {}
     for error, name, contact, modulus in sorted(coarse):
         best.setdefault(name, (error, contact, modulus))
@@ -98,6 +100,11 @@ def best_first(starts: Sequence[Start]) -> list[Start]:
 def said(error: float) -> str:
     """An error for people."""
     return "diverges" if error >= DIVERGED else f"objective {error:.3f}"
+
+
+def _errors(problem: Problem, motion: Motion, name: str, contact: str, moduli: Sequence[float]) -> list[float]:
+    """Of several moduli at once: another process reads the pictures for each task anew."""
+    return [_error(problem, motion, name, contact, modulus) for modulus in moduli]
 
 
 def _searched(
