@@ -69,6 +69,7 @@ def test_the_same_request_resumes_and_another_is_refused(tmp_path):
     with run.stage("reconstruct"):
         pass
     RunFolder.create_or_resume(path, request(tmp_path))
+    RunFolder.create_or_resume(path, request(tmp_path, reconstruct__processes=1))  # which changes no number
     cases = [
         (request(tmp_path, fit_frames=10), "fit_frames 12 → 10"),
         (request(tmp_path, holdout=()), "holdout_cameras"),
