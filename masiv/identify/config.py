@@ -25,8 +25,9 @@ class IdentifyConfig(BaseModel):
     )
     adapter_rank: int = Field(2, ge=1, le=4, description="shapes of strain dependence that an adapter may learn")
     family_rollouts: int = Field(45, ge=2, description="rollouts of each of the two stages of a classical law's fit")
-    start: Literal["auto", "jelly", "plasticine", "sand", "water"] = Field(
-        "auto", description="pretrained law to start from; auto takes the one that explains the motion best"
+    start: Literal["auto", "jelly", "plasticine", "sand", "water", "honey"] = Field(
+        "auto",
+        description="law to start from, four of them pretrained; auto: the one that is nearest to what was observed",
     )
     contact: Literal["auto", "sticky", "release", "slip"] = Field("auto", description="how the ground holds the body")
     processes: int = Field(
@@ -34,7 +35,7 @@ class IdentifyConfig(BaseModel):
         description="processes that try starting laws side by side; 0: one for each core that Taichi may use, four at "
         "most; on a GPU always one",
     )  # fmt: skip
-    search_particles: int = Field(1000, ge=100, description="particles of the rollouts that choose the start")
+    search_particles: int = Field(2000, ge=100, description="particles of the rollouts that choose the start")
     iterations: int = Field(120, ge=0, description="rollouts of the joint fit")
     samples_per_frame: int = Field(2, ge=1, le=16, description="instants per frame at which trajectories are compared")
     law_learning_rate: float = Field(4e-3, gt=0, description="step of the network weights")

@@ -25,8 +25,12 @@ from masiv.workers import Workers, demanded
 MODULI = (3e3, 1e4, 3e4, 1e5, 3e5)
 """P-wave moduli tried [Pa at 1000 kg/m^3]: waves of 1.7 to 17 m/s, from what sags at once to what hardly deforms in a
 throw."""
-STEPS = (0.5, 1.0, 0.7, 0.7)
-"""First steps of the simplex search in the logarithms of ``NeuralLaw.scales``; what is elastic has the first two."""
+FLUID = "honey"
+"""A viscous fluid, which needs no teaching: constants. (The pretrained water has no viscosity.)"""
+SEARCHED = {"jelly": (0.5, 0, 0, 0), FLUID: (0.5, 0, 0, 0.7)}
+FLOWS = 0.5, 0, 0.7, 0
+"""First steps of a simplex search in the logarithms of ``NeuralLaw.scales``, 0 where one is left to the fit: few
+particles on a coarse grid are another model, and a search over all four makes up for it with the material."""
 DIVERGED = 1e3
 ELASTIC = "jelly"
 TELLS = 1.1
@@ -55,40 +59,34 @@ def with_scales(law: NeuralLaw, modulus: float, logs: Sequence[float] = ()) -> N
 
 
 def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: Workers | None = None) -> list[Start]:
-    """Candidates, best first: each material at each of ``MODULI``, then simplex search over the scales of two; the
-    elastic one counts as the better where another is hardly nearer (``TELLS``).
+    """Candidates, best first: each material at each of ``MODULI``, then contacts and a simplex search over scales for
+    two; the elastic one counts as the better where another is hardly nearer (``TELLS``).
 
     problem: with few particles. Rollouts run side by side in ``workers``, and give the same to the bit in whichever.
     Raises MasivError where every candidate diverges.
     """
     config, workers = problem.config, workers or Workers()
-    materials = list(MATERIALS) if config.start == "auto" else [config.start]
+    materials = [*MATERIALS, FLUID] if config.start == "auto" else [config.start]
     contacts = ["sticky", "release"] if config.contact == "auto" else [config.contact]
     if problem.scene.ground is None:
         contacts = ["none"]
     density = problem.scene.density / 1000
     moduli = [modulus * density for modulus in MODULI]
-    kinds = [(name, contact) for name in materials for contact in contacts]
-    coarse: list[tuple[float, str, str, float]] = []
     if compared(problem):
         _ = problem.blob_size, problem.paint  # found here once, or each process would find its own
-    found = workers.map(_errors, [(problem, motion, *kind, moduli) for kind in kinds])
-    for (name, contact), errors in zip(kinds, map(demanded, found), strict=True):
-        coarse += [(error, name, contact, modulus) for error, modulus in zip(errors, moduli, strict=True)]
-        total = len(kinds) * len(moduli)
-        progress("identify: start", len(coarse), total, f"{name}, {contact}: {said(min(errors))}")
-    best = {}
-    for error, name, contact, modulus in sorted(coarse):
-        best.setdefault(name, (error, contact, modulus))
-    if min(entry[0] for entry in best.values()) >= DIVERGED:
+    found = map(demanded, workers.map(_errors, [(problem, motion, name, contacts[0], moduli) for name in materials]))
+    best: dict[str, tuple[float, float]] = {}
+    for done, (name, errors) in enumerate(zip(materials, found, strict=True)):
+        best[name] = min(zip(errors, moduli, strict=True))
+        progress("identify: start", done + 1, len(materials), f"{name}, {contacts[0]}: {said(best[name][0])}")
+    if min(best.values())[0] >= DIVERGED:
         raise MasivError("identify: every starting law diverges; check the scene's ground, gravity and units")
-    ranked = sorted(best, key=lambda name: best[name][0])[:2]
+    ranked = sorted(best, key=lambda name: best[name])[:2]
+    searched = workers.map(_searched, [(problem, motion, name, contacts, *best[name]) for name in ranked])
     starts = []
-    searched = workers.map(_searched, [(problem, motion, name, *best[name]) for name in ranked])
-    for done, (name, (logs, error)) in enumerate(zip(ranked, map(demanded, searched), strict=True)):
-        _, contact, modulus = best[name]
-        starts.append(Start(name, contact, with_scales(_pretrained(name), modulus, logs), error))
-        progress("identify: start", done + 1, len(ranked), f"{name}: {said(starts[-1].error)}")
+    for done, (name, (contact, logs, error)) in enumerate(zip(ranked, map(demanded, searched), strict=True)):
+        starts.append(Start(name, contact, with_scales(_law(name), best[name][1], logs), error))
+        progress("identify: start", done + 1, len(ranked), f"{name}, {contact}: {said(error)}")
     return best_first(starts)
 
 
@@ -108,28 +106,35 @@ def _errors(problem: Problem, motion: Motion, name: str, contact: str, moduli: S
 
 
 def _searched(
-    problem: Problem, motion: Motion, name: str, error: float, contact: str, modulus: float
-) -> tuple[list[float], float]:
-    """Logarithms of factors of the scales, and the error, after a simplex search from a candidate."""
-    steps = STEPS[:2] if name == ELASTIC else STEPS
+    problem: Problem, motion: Motion, name: str, contacts: Sequence[str], error: float, modulus: float
+) -> tuple[str, tuple[float, ...], float]:
+    """The best of ``contacts``, and logarithms of factors of the scales and the error after a simplex search from a
+    candidate, whose ``error`` is that of the first contact."""
+    others = [(_error(problem, motion, name, contact, modulus), contact) for contact in contacts[1:]]
+    error, contact = min([(error, contacts[0]), *others])
+    steps = np.array(SEARCHED.get(name, FLOWS))
+    moved = np.flatnonzero(steps)
 
-    def searched(logs: np.ndarray) -> float:
-        return _error(problem, motion, name, contact, modulus, tuple(logs)) if logs.any() else error
+    def logs(point: np.ndarray) -> tuple[float, ...]:
+        every = np.zeros(len(steps))
+        every[moved] = point
+        return tuple(float(log) for log in every)
 
+    def searched(point: np.ndarray) -> float:
+        return _error(problem, motion, name, contact, modulus, logs(point)) if point.any() else error
+
+    simplex = np.vstack([np.zeros(len(moved)), np.diag(steps[moved])])
     found = minimize(
-        searched,
-        np.zeros(len(steps)),
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": np.vstack([np.zeros(len(steps)), np.diag(steps)]), "maxfev": 12 * len(steps),
-            "xatol": 0.02, "fatol": 1e-4,
-        },
+        searched, simplex[0], method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": 12 * len(moved), "xatol": 0.02, "fatol": 1e-4},
     )  # fmt: skip
-    return [float(log) for log in found.x], float(found.fun)
+    return contact, logs(found.x), float(found.fun)
 
 
 @functools.lru_cache
-def _pretrained(name: str) -> NeuralLaw:
+def _law(name: str) -> NeuralLaw:
+    if name == FLUID:
+        return NeuralLaw.maxwell(shear_modulus=1e4, bulk_modulus=1e5, relaxation_time=5e-3)
     return load_law(pretrained_path(name))
 
 
@@ -137,7 +142,7 @@ def _pretrained(name: str) -> NeuralLaw:
 def _error(
     problem: Problem, motion: Motion, name: str, contact: str, modulus: float, logs: tuple[float, ...] = ()
 ) -> float:
-    scaled = with_scales(_pretrained(name), modulus, logs)
+    scaled = with_scales(_law(name), modulus, logs)
     try:
         return objective(problem, problem.run(scaled, motion, contact, problem.frames))
     except InputError:

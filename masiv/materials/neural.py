@@ -69,6 +69,23 @@ class NeuralLaw(Law):
         self.log_bulk_ratio = torch.nn.Parameter(torch.tensor(0.0))
         self.log_flow_rate = torch.nn.Parameter(torch.tensor(0.0))
 
+    @classmethod
+    def maxwell(
+        cls, *, shear_modulus: float, bulk_modulus: float, relaxation_time: float, width: int = 24, seed: int = 0
+    ) -> NeuralLaw:
+        """A Maxwell fluid: moduli [Pa] and relaxation time [s] are the same at all strains. In motions that are slow
+        beside the relaxation time it is Newtonian, of viscosity shear modulus x relaxation time [Pa s]."""
+        law = cls(stress_scale=shear_modulus, width=width, seed=seed)
+        least = -2 * LOG_MODULUS_RANGE  # as little as the networks can say
+        bulk = LOG_MODULUS_RANGE * math.atanh(math.log(bulk_modulus / shear_modulus) / LOG_MODULUS_RANGE)
+        rate = LOG_RATE_RANGE * math.atanh(-math.log(relaxation_time) / LOG_RATE_RANGE)
+        constants = (law.elastic, (0.0, least, bulk, 0.0)), (law.plastic, (rate, -2 * LOG_RATE_RANGE))
+        with torch.no_grad():
+            for network, values in constants:
+                network[-1].weight.zero_()
+                network[-1].bias.copy_(torch.tensor(values))
+        return law
+
     def scales(self) -> list[torch.nn.Parameter]:
         """Logarithms of stress scale, bulk ratio, flow strain and rate of the isochoric flow, each ()."""
         return [self.log_stress_scale, self.log_bulk_ratio, self.log_flow_strain, self.log_flow_rate]

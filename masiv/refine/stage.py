@@ -30,9 +30,10 @@ COMPETITORS = {
     "jelly": ("neo_hookean", "von_mises"),
     "plasticine": ("von_mises", "neo_hookean", "non_newtonian"),
     "water": ("newtonian", "non_newtonian"),
+    "honey": ("newtonian", "non_newtonian"),
     "sand": ("drucker_prager", "von_mises"),
 }
-"""Classical laws that are worth a try, by the pretrained law whose rollout was nearest to the motion in identify."""
+"""Classical laws that are worth a try, by the law whose rollout was nearest to the motion in identify."""
 
 
 @dataclass(frozen=True)
