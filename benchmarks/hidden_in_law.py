@@ -37,7 +37,7 @@ def main():
     runtime.start("cpu")
     torch.set_num_threads(1)
     settings = load_config(preset="quick")
-    config = settings.identify.model_copy(update={"silhouette_weight": 0.0, "contact": "sticky"})
+    config = settings.identify.model_copy(update={"pictures": 0, "contact": "sticky"})
     kind, parameters = ELASTIC
     laws, errors = {"truth": ClassicalLaw(kind, **parameters)}, {}
 

@@ -115,7 +115,7 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
     run, settings, scene = stages.open_run(
         case.scene, folder, preset=preset, config=overrides(case.settings, out / "config.yaml"), seed=case.seed,
         fit_frames=fit_frames, law=family if case.law in ("true", "told") else case.law,
-        geometry_loss=case.geometry_loss, silhouette_weight=None if case.silhouette else 0.0,
+        geometry_loss=case.geometry_loss, pictures=None if case.silhouette else 0,
     )  # fmt: skip
     stages.start(settings)
     trajectory = stages.load_trajectory(run)

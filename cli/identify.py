@@ -36,12 +36,12 @@ def identify(
         typer.Option(
             "--geometry-loss",
             help="What a neural law is fitted to: trajectory (paths of particles, then surfaces; paths alone with "
-            "identify.polish: false), continuum (bodies frame by frame), surface, or none (silhouettes alone). "
+            "identify.polish: false), continuum (bodies frame by frame), surface, or none (pictures alone). "
             "[default: trajectory]",
         ),
     ] = None,
     no_silhouette: Annotated[
-        bool, typer.Option("--no-silhouette", help="Fit a neural law without silhouettes.")
+        bool, typer.Option("--no-silhouette", help="Fit a neural law without silhouettes and paint: to geometry alone.")
     ] = False,
     fit_frames: FitFramesOption = None,
     holdout: HoldoutOption = None,
@@ -80,7 +80,7 @@ def identify(
         holdout=holdout,
         law=law,
         geometry_loss=geometry_loss,
-        silhouette_weight=0.0 if no_silhouette else None,
+        pictures=0 if no_silhouette else None,
     )
     stages.start(settings)
     from masiv.mpm.simulate import simulate

@@ -47,7 +47,7 @@ def filmed(seen):  # noqa: F811
 
 
 def problem_of(filmed, seen, **changes):  # noqa: F811
-    config = settings(pictures=4, iterations=16, **changes)
+    config = settings(**{"pictures": 4, "iterations": 16, **changes})
     return Problem(filmed, seen[0], config, SimulatorConfig())
 
 
@@ -96,7 +96,7 @@ def test_a_checkpoint_of_an_older_fit_is_refused_in_a_sentence(filmed, seen):  #
 
 def test_surfaces_have_the_last_word_only_where_silhouettes_can_judge(filmed, seen):  # noqa: F811
     assert polish.wanted(problem_of(filmed, seen))
-    for changes in ({"polish": False}, {"geometry_loss": "surface"}, {"silhouette_weight": 0.0}):
+    for changes in ({"polish": False}, {"geometry_loss": "surface"}, {"pictures": 0}):
         assert not polish.wanted(problem_of(filmed, seen, **changes))
     assert not polish.wanted(problem_of(scene(), seen))
     pictures = some_of_each(problem_of(filmed, seen), 3, 2)

@@ -46,11 +46,11 @@ class IdentifyConfig(BaseModel):
     geometry_loss: Literal["trajectory", "continuum", "surface", "none"] = Field(
         "trajectory",
         description="what of the observed motion a neural law is fitted to: paths of particles, bodies frame by frame, "
-        "their surfaces, or silhouettes alone",
+        "their surfaces, or pictures alone",
     )
     polish: bool = Field(
         True,
-        description="after a fit to paths, half as many iterations on surfaces, kept where the silhouettes are nearer",
+        description="after a fit to paths, half as many iterations on surfaces, kept where the pictures are nearer",
     )
     trajectory_weight: float = Field(1.0, ge=0, description="of geometry_loss")
     silhouette_weight: float = Field(0.2, ge=0, description="of the silhouettes, while paths lead")

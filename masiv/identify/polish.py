@@ -1,7 +1,8 @@
 """Paths first, then surfaces: what pictures tell for certain has the last word.
 
 Paths of particles say which matter went where, and lead a fit from far away. In a body that flows they drift with what
-the pictures do not show, and a law that is fitted to them learns the drift. Surfaces and silhouettes do not drift.
+the pictures do not show, and a law that is fitted to them learns the drift. Surfaces, silhouettes and paint do not
+drift.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.identify.fit import Fit, fit
-from masiv.identify.pictures import picture_errors, picture_objective, some_of_each
+from masiv.identify.pictures import compared, picture_errors, picture_objective, some_of_each
 from masiv.identify.problem import Problem
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
@@ -20,10 +21,8 @@ VIEWS = 3
 
 
 def wanted(problem: Problem) -> bool:
-    """Whether surfaces have the last word: a fit to paths that has silhouettes to be judged by."""
-    config = problem.config
-    judged = bool(problem.scene.views) and config.silhouette_weight > 0 and config.pictures > 0
-    return config.polish and config.geometry_loss == "trajectory" and judged
+    """Whether surfaces have the last word: a fit to paths that has pictures to be judged by."""
+    return problem.config.polish and problem.config.geometry_loss == "trajectory" and compared(problem)
 
 
 def polish(
@@ -36,8 +35,8 @@ def polish(
     checkpoint: Checkpoint,
     progress: Progress,
 ) -> tuple[Fit, dict[str, float]]:
-    """``fitted``, a neural law, after half as many iterations with surfaces in place of paths, or as it is where its
-    silhouettes were nearer to the masks; and both silhouette errors."""
+    """``fitted``, a neural law, after half as many iterations with surfaces in place of paths, or as it is where it
+    was nearer to the pictures; and how near both are."""
     surfaces = problem.of_surfaces(problem.config.iterations // 2)
     other = fit(
         surfaces, fitted.law, fitted.motion, contact, surfaces.frames,
