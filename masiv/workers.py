@@ -72,17 +72,37 @@ class Workers:
         if self.processes == 1 or len(tasks) == 1:
             yield from (attempt(function, task) for task in tasks)
             return
-        from concurrent.futures.process import BrokenProcessPool
-
         futures = [self._started().submit(attempt, function, task) for task in tasks]
         try:
             for future in futures:
-                yield future.result()
-        except BrokenProcessPool as died:
-            raise MasivError(f"a worker process died, of too little memory perhaps: set {self.key} to 1") from died
+                with self._dying():
+                    found = future.result()
+                yield found
         finally:
             for future in futures:
                 future.cancel()
+
+    def beside(self, function: Callable, task: tuple) -> Callable[[], Any]:
+        """Begin ``function(*task)`` in another process and go on; what is returned waits for its result, or ``Failed``.
+        Where there is no other process the task runs then. Raises MasivError where the process has died."""
+        if self.processes == 1:
+            return lambda: attempt(function, task)
+        future = self._started().submit(attempt, function, task)
+
+        def result() -> Any:
+            with self._dying():
+                return future.result()
+
+        return result
+
+    @contextmanager
+    def _dying(self) -> Iterator[None]:
+        from concurrent.futures.process import BrokenProcessPool
+
+        try:
+            yield
+        except BrokenProcessPool as died:
+            raise MasivError(f"a worker process died, of too little memory perhaps: set {self.key} to 1") from died
 
     def _started(self) -> Any:
         if self._pool is None:

@@ -85,6 +85,14 @@ def test_a_process_that_dies_is_told_of():
         list(workers.map(dies, [(), ()]))
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_task_beside_this_process(processes):
+    with Workers(processes) as workers:
+        here, failing = workers.beside(os.getpid, ()), workers.beside(blamed, ())
+        assert (here() == os.getpid()) == (processes == 1)
+        assert isinstance(failing(), Failed)
+
+
 def test_as_many_as_asked_or_as_there_are_cores():
     assert processes_wanted(3) == 3
     assert 1 <= processes_wanted(0) <= 4
@@ -92,6 +100,7 @@ def test_as_many_as_asked_or_as_there_are_cores():
 
 def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.identify.start.MODULI", (1e4, 3e4))
+    monkeypatch.setattr("masiv.identify.start.REFINED", 2)
     motion = observed({})
     motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)

@@ -55,7 +55,7 @@ class IdentifyConfig(BaseModel):
     trajectory_weight: float = Field(1.0, ge=0, description="of geometry_loss")
     silhouette_weight: float = Field(0.2, ge=0, description="of the silhouettes, while paths lead")
     polish_silhouette_weight: float = Field(1.0, ge=0, description="of the silhouettes, after the paths")
-    paint_weight: float = Field(0.5, ge=0, description="of the paint that particles carry along, while paths lead")
+    paint_weight: float = Field(0.1, ge=0, description="of the paint that particles carry along, while paths lead")
     polish_paint_weight: float = Field(1.0, ge=0, description="of the paint, after the paths")
     prior_weight: float = Field(
         1e-2, ge=0,

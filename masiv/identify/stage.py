@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -14,18 +12,13 @@ from masiv.checkpoint import Checkpoint
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.baseline import identify_classical
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.fit import fit, fit_from, fit_state
-from masiv.identify.found import Found, history_rows
 from masiv.identify.launch import estimate_launch
-from masiv.identify.polish import polish, wanted
+from masiv.identify.learn import learn
 from masiv.identify.problem import Motion, Problem
-from masiv.identify.start import Start, choose_start
-from masiv.materials.neural import NeuralLaw
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.twin import Twin
-from masiv.workers import Workers, processes_wanted
 
 
 def identify(
@@ -68,7 +61,7 @@ def _identify(
     first_frames = min(launch.last_frame + 2, problem.frames)
     few = functools.partial(Problem, scene, trajectory, config, simulator, particles=config.search_particles, seed=seed)
     if config.law == "neural":
-        found = _neural(problem, few, motion, first_frames, seed, checkpoint, progress)
+        found = learn(problem, few, motion, first_frames, seed, checkpoint, progress)
     else:
         found = identify_classical(problem, few(), motion, first_frames, seed, checkpoint, progress)
     return Twin(
@@ -117,7 +110,7 @@ def relearn(
     raised = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
     motion = Motion.of_world(axes, twin.velocity, twin.omega, raised)
     with runtime.torch_threads(1):
-        found = _neural(problem, few, motion, (problem.frames + 1) // 2, seed, checkpoint or Checkpoint(None), progress)
+        found = learn(problem, few, motion, (problem.frames + 1) // 2, seed, checkpoint or Checkpoint(None), progress)
     return replace(
         twin,
         velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
@@ -127,67 +120,3 @@ def relearn(
         law=found.law,
         fit={**twin.fit, **found.report, "trajectory_error_mm": 1e3 * found.error_m, "history": found.history},
     )
-
-
-def _neural(
-    problem: Problem,
-    few: Callable[[], Problem],
-    motion: Motion,
-    first_frames: int,
-    seed: int,
-    checkpoint: Checkpoint,
-    progress: Progress,
-) -> Found:
-    saved = checkpoint.load() or {}
-    if "start" in saved:
-        start = _start_from(saved["start"])
-    else:
-        with Workers(processes_wanted(problem.config.processes), "identify.processes") as workers:
-            start = choose_start(few(), motion, progress, workers)[0]
-    fixed: dict[str, Any] = {"start": _start_state(start)}
-    keeper = _With(checkpoint, fixed)
-    keeper.save({**saved})
-    if "paths" in saved:
-        fitted = fit_from(saved["paths"], NeuralLaw(width=start.law.width))
-    else:
-        fitted = fit(
-            problem, start.law, motion, start.contact, first_frames, seed=seed, checkpoint=keeper, progress=progress
-        )
-    report: dict[str, Any] = {"start": start.material, "geometry_loss": problem.config.geometry_loss}
-    if wanted(problem):
-        keeper = _With(checkpoint, {**fixed, "paths": fit_state(fitted)})
-        if "paths" not in saved:
-            keeper.save({})
-        fitted, seen = polish(
-            problem, fitted, start.contact, start.law, seed=seed, checkpoint=keeper, progress=progress
-        )  # fmt: skip
-        report |= seen
-    report["start_objective"] = start.error
-    return Found(fitted.law, fitted.motion, start.contact, fitted.error_m, report, history_rows(fitted))
-
-
-class _With(Checkpoint):
-    """A checkpoint whose every state also holds ``fixed``."""
-
-    def __init__(self, checkpoint: Checkpoint, fixed: dict) -> None:
-        super().__init__(checkpoint.path, checkpoint.every_s)
-        self.fixed = fixed
-
-    def save(self, state: dict) -> None:
-        super().save({**state, **self.fixed})
-
-
-def _start_state(start: Start) -> dict:
-    return {
-        "material": start.material,
-        "contact": start.contact,
-        "error": start.error,
-        "width": start.law.width,
-        "law": start.law.state_dict(),
-    }
-
-
-def _start_from(state: dict) -> Start:
-    law = NeuralLaw(width=state["width"])
-    law.load_state_dict(state["law"])
-    return Start(state["material"], state["contact"], law, state["error"])

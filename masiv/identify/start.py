@@ -31,6 +31,8 @@ SEARCHED = {"jelly": (0.5, 0, 0, 0), FLUID: (0.5, 0, 0, 0.7)}
 FLOWS = 0.5, 0, 0.7, 0
 """First steps of a simplex search in the logarithms of ``NeuralLaw.scales``, 0 where one is left to the fit: few
 particles on a coarse grid are another model, and a search over all four makes up for it with the material."""
+REFINED = 3
+"""Materials that are searched further: a plastic one may be far off at every stiffness, until its yield strain is."""
 DIVERGED = 1e3
 ELASTIC = "jelly"
 TELLS = 1.1
@@ -38,7 +40,7 @@ TELLS = 1.1
 the motion does not reach would be invented: the body breaks there as soon as a prediction stretches it farther."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Start:
     """A law to start from; error: ``objective`` of its rollout with few particles."""
 
@@ -60,7 +62,7 @@ def with_scales(law: NeuralLaw, modulus: float, logs: Sequence[float] = ()) -> N
 
 def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: Workers | None = None) -> list[Start]:
     """Candidates, best first: each material at each of ``MODULI``, then contacts and a simplex search over scales for
-    two; the elastic one counts as the better where another is hardly nearer (``TELLS``).
+    most; the elastic one counts as the better where another is hardly nearer (``TELLS``).
 
     problem: with few particles. Rollouts run side by side in ``workers``, and give the same to the bit in whichever.
     Raises MasivError where every candidate diverges.
@@ -81,7 +83,7 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: 
         progress("identify: start", done + 1, len(materials), f"{name}, {contacts[0]}: {said(best[name][0])}")
     if min(best.values())[0] >= DIVERGED:
         raise MasivError("identify: every starting law diverges; check the scene's ground, gravity and units")
-    ranked = sorted(best, key=lambda name: best[name])[:2]
+    ranked = sorted(best, key=lambda name: best[name])[:REFINED]
     searched = workers.map(_searched, [(problem, motion, name, contacts, *best[name]) for name in ranked])
     starts = []
     for done, (name, (contact, logs, error)) in enumerate(zip(ranked, map(demanded, searched), strict=True)):
