@@ -56,7 +56,7 @@ class IdentifyConfig(BaseModel):
     silhouette_weight: float = Field(0.2, ge=0, description="of the silhouettes, while paths lead")
     polish_silhouette_weight: float = Field(1.0, ge=0, description="of the silhouettes, after the paths")
     paint_weight: float = Field(0.1, ge=0, description="of the paint that particles carry along, while paths lead")
-    polish_paint_weight: float = Field(1.0, ge=0, description="of the paint, after the paths")
+    polish_paint_weight: float = Field(0.3, ge=0, description="of the paint, after the paths")
     prior_weight: float = Field(
         1e-2, ge=0,
         description="of the mean square by which a neural law's log moduli and log rates leave those it started with, "
