@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from contextlib import nullcontext
 from typing import Any
@@ -38,7 +39,8 @@ def reconstruct(
     followed instead of found again. Raises MasivError where no frame shows the object or the fit diverges.
     A finished stage leaves its last state in ``checkpoint``; whoever saves the result clears it.
     """
-    two = config.pictures > 1 and processes_wanted(config.processes) > 1
+    # Windows hands no files on to another process.
+    two = config.pictures > 1 and processes_wanted(config.processes) > 1 and os.name == "posix"
     # On a few cores, two processes on half the threads each; the numbers depend on the threads, not on the processes.
     with runtime.torch_threads(max(1, torch.get_num_threads() // 2)), Second() if two else nullcontext() as second:
         fit = _Fit(scene, config, seed, checkpoint.load(), progress, second)
