@@ -44,6 +44,8 @@ STRENGTHS = {
     "time_offset": [{"delay": 0.02}, {"delay": -0.015}],
 }  # fmt: skip
 
+OTHER = {"viscosity": "stiff", "restitution": "stiff"}
+"""The second material of an effect, where that is not the plastic one: what damps or bounces hardly shows there."""
 OUTSIDE = {
     "attraction": {"strength": 0.5, "x": 0.6, "y": 0.7, "z": 0.5},
     "gust": {"acceleration": 20.0, "begin": 0.1, "end": 0.2},
@@ -52,15 +54,15 @@ OUTSIDE = {
 
 
 def cases():
-    """Controls of every material; every effect, strong on an elastic body and weak on another; two at once; unknown."""
+    """Controls of every material; every effect, strong on an elastic body and weak on another; two at once; unknown;
+    and the other way round, weak on an elastic body and strong on another."""
     from track_cases import Case
 
     out = []
     for material, (law, parameters) in MATERIALS.items():
         out.append(Case(f"control_{material}", law, parameters, {}, seed=len(out)))
     for effect, strengths in STRENGTHS.items():
-        # What damps or bounces would hardly show beside plastic flow.
-        other = "stiff" if effect in ("viscosity", "restitution") else "plastic"
+        other = OTHER.get(effect, "plastic")
         for values, material in ((strengths[-1], "elastic"), (strengths[0], other)):
             law, parameters = MATERIALS[material]
             out.append(Case(f"{effect}_{material}", law, parameters, {effect: values}, seed=len(out)))
@@ -71,6 +73,13 @@ def cases():
     out.append(Case("linear_drag+viscosity", law, parameters, two, seed=len(out)))
     for name, values in OUTSIDE.items():
         out.append(Case(f"unknown_{name}", law, parameters, {}, seed=len(out), outside={name: values}))
+    for effect, strengths in STRENGTHS.items():
+        if len(strengths) > 1:
+            other = OTHER.get(effect, "plastic")
+            for values, material, word in ((strengths[0], "elastic", "weak"), (strengths[-1], other, "strong")):
+                law, parameters = MATERIALS[material]
+                name = f"{effect}_{material}_{word}"
+                out.append(Case(name, law, parameters, {effect: values}, seed=len(out)))
     return sorted(out, key=lambda case: case.law != "neo_hookean" or case.name.endswith("_stiff"))
 
 
