@@ -359,18 +359,18 @@ def test_each_scale_of_a_neural_law_moves_what_it_is_named_after():
 @torch.no_grad()
 def test_a_maxwell_fluid_is_newtonian_in_slow_shear():
     """Simple shear at a rate of 1/s: stress is viscosity times rate, and stays there; pressure is of the volume."""
-    shear_modulus, bulk_modulus, relaxation_time, dt = 1e4, 1e5, 5e-3, 1e-4
+    shear_modulus, bulk_modulus, relaxation_time, dt = 1e4, 1e5, 5e-3, 2e-4
     law = NeuralLaw.maxwell(
         shear_modulus=shear_modulus, bulk_modulus=bulk_modulus, relaxation_time=relaxation_time
     ).double()  # fmt: skip
     step, f = torch.eye(3, dtype=F64), torch.eye(3, dtype=F64)[None]
     step[0, 1] = 1.0 * dt
     sheared = []
-    for _ in range(1000):
+    for _ in range(250):
         f = law.project(step @ f, dt)
         sheared.append(float(law.stress(f)[0, 0, 1]))
     assert sheared[-1] == pytest.approx(shear_modulus * relaxation_time, rel=0.03)
-    assert sheared[-1] == pytest.approx(sheared[500], rel=1e-3)
+    assert sheared[-1] == pytest.approx(sheared[200], rel=1e-3)
     squeezed = law.project(0.999 * torch.eye(3, dtype=F64)[None], 1.0)
     assert float(law.stress(squeezed)[0, 0, 0]) == pytest.approx(-3e-3 * bulk_modulus, rel=0.01)
 
