@@ -44,7 +44,8 @@ def learn(
             fitted = fit_from(saved["fitted"], NeuralLaw(width=start.law.width))
         else:
             keeper.save(saved)
-            rest = [workers.beside(_fitted, (problem, s, motion, first_frames, seed)) for s in starts[1:]]
+            heard = silent if workers.processes > 1 else (lambda _, *said: progress("identify: fit a rival", *said))
+            rest = [workers.beside(_fitted, (problem, s, motion, first_frames, seed, heard)) for s in starts[1:]]
             reached = [(starts[0], _fit(problem, starts[0], motion, first_frames, seed, keeper, progress))]
             for rival, waited in zip(starts[1:], rest, strict=True):
                 state = waited()
@@ -83,9 +84,9 @@ def _fit(
     return fit(problem, start.law, motion, start.contact, first, seed=seed, checkpoint=checkpoint, progress=progress)
 
 
-def _fitted(problem: Problem, start: Start, motion: Motion, first: int, seed: int) -> dict:
+def _fitted(problem: Problem, start: Start, motion: Motion, first: int, seed: int, progress: Progress) -> dict:
     """The state of a fit, as a task of another process."""
-    return fit_state(_fit(problem, start, motion, first, seed, Checkpoint(None), silent))
+    return fit_state(_fit(problem, start, motion, first, seed, Checkpoint(None), progress))
 
 
 class _With(Checkpoint):
