@@ -32,8 +32,8 @@ class IdentifyConfig(BaseModel):
     contact: Literal["auto", "sticky", "release", "slip"] = Field("auto", description="how the ground holds the body")
     processes: int = Field(
         0, ge=0, le=32,
-        description="processes that try starting laws side by side; 0: one for each core that Taichi may use, four at "
-        "most; on a GPU always one",
+        description="processes that try starting laws, and fit two, side by side; 0: one for each core that Taichi may "
+        "use, four at most; on a GPU always one",
     )  # fmt: skip
     search_particles: int = Field(2000, ge=100, description="particles of the rollouts that choose the start")
     iterations: int = Field(120, ge=0, description="rollouts of the joint fit")
