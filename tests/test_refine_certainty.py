@@ -9,7 +9,7 @@ import pytest
 
 from masiv.identify.parametric import Parameter
 from masiv.identify.smoothness import smoothness
-from masiv.refine.certainty import certainty
+from masiv.refine.certainty import certainty, told_apart
 
 INSTANTS, POINTS = 11, 120
 LENGTH, METRES, SIZE = 2.0, 0.12, 2e-3
@@ -82,6 +82,38 @@ def test_lengths_are_those_of_the_noise_though_a_fit_took_its_smoothest_part():
 def test_noise_alone_is_as_certain_as_chance_has_it(pattern):
     sigmas = [certainty(*found(noise, pattern, 0.0), WATCHED) for noise in noises(60, seed=2)]
     assert np.mean(np.square(sigmas)) == pytest.approx(1.0, rel=0.6)
+
+
+def rivals(noise, patterns, strengths):
+    """Least squares of each of two ``patterns`` alone, where both are there with ``strengths``."""
+    target = fields_of(*patterns) @ np.array(strengths) + noise.ravel()
+    out = []
+    for pattern in patterns:
+        jacobian = fields_of(*launch(), pattern)
+        theta = np.linalg.lstsq(jacobian, target, rcond=None)[0]
+        out.append(SimpleNamespace(residual=jacobian @ theta - target, jacobian=jacobian))
+    return out
+
+
+BOTH = SMOOTH, (TIMES**2)[:, None, None] * np.array([3e-3, 0.0, 0.0]) * (1 + 3 * PLACES[:, :1])
+
+
+def test_of_two_causes_that_are_as_near_to_the_truth_chance_decides():
+    fits = [rivals(noise, BOTH, (0.0, 0.0)) for noise in noises(40, seed=5)]
+    sigmas = [told_apart(*fit, WATCHED) for fit in fits]
+    assert np.mean(np.square(sigmas)) < 1.6
+    assert np.mean(np.abs(sigmas) > 2) <= 0.1
+    assert told_apart(fits[0][0], fits[0][1], WATCHED) == pytest.approx(-told_apart(*fits[0][::-1], WATCHED), rel=0.5)
+
+
+def test_a_cause_that_is_there_is_told_from_one_that_is_not_the_better_the_more_they_differ():
+    (noise,) = noises(1, seed=6)
+    there, other = rivals(noise, BOTH, (1.0, 0.0))
+    assert told_apart(there, other, WATCHED) > 4
+    nearly = SMOOTH * (1 + 0.003 * PLACES[:, :1])
+    there, other = rivals(noise, (SMOOTH, nearly), (1.0, 0.0))
+    assert abs(told_apart(there, other, WATCHED)) < 2
+    assert told_apart(there, there, WATCHED) == 0.0
 
 
 def test_a_smooth_cause_is_less_certain_than_a_rough_one_of_the_same_size():

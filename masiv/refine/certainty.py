@@ -61,6 +61,24 @@ def certainty(fitted: Fitted, term: Term, experiments: Sequence[Watched]) -> flo
     return min(float(norm.isf(chance / 2)), UTMOST) if chance > 0 else UTMOST
 
 
+def told_apart(best: Fitted, other: Fitted, experiments: Sequence[Watched]) -> float | None:
+    """By how many standard deviations ``best`` explains the fitted instants better than ``other``, a model that need
+    not contain it (Vuong, Econometrica 57, 1989): the difference of their sums of squares, over what a noise as smooth
+    as what ``best`` leaves would make of it, were both as near to the truth. None where the residual cannot tell how
+    smooth that noise is."""
+    apart = other.residual - best.residual
+    gained = float(apart @ (other.residual + best.residual))
+    variance = 0.0
+    for e, part in _parts(best.residual.size, experiments):
+        field = best.residual[part].reshape(e.rows, len(e.places), -1)
+        noise, scale = _noise_of(field, best.jacobian[part].reshape(*field.shape, -1), e)
+        if noise is None:
+            return None
+        # d|r|² = 2 d·r: the noise enters along the difference of the two predictions.
+        variance += 4 * float(covariance_of(apart[part].reshape(*field.shape, 1), noise, e.places, scale)[0, 0])
+    return gained / math.sqrt(variance) if variance > 0 else 0.0
+
+
 def _parts(size: int, experiments: Sequence[Watched]) -> Iterator[tuple[Watched, slice]]:
     """What of a residual of ``size`` is of which experiment; all are measured in as many axes."""
     fitted = [e for e in experiments if e.rows]

@@ -55,4 +55,7 @@ class RefineConfig(BaseModel):
     )  # fmt: skip
     least_bic: float = Field(10.0, ge=0, description="how far an effect must lower the information criterion")
     least_sigmas: float = Field(3.0, ge=0, description="standard errors that a strength must lie from zero")
+    least_apart: float = Field(
+        2.0, ge=0, description="sigmas of smooth noise from which one cause is told from another that explains less"
+    )
     confusable: float = Field(0.95, gt=0, le=1, description="correlation from which two effects look alike")

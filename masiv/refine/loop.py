@@ -11,7 +11,8 @@ import numpy as np
 from masiv.errors import MasivError
 from masiv.refine.add_effect import CHORD_STEPS, refit
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import above_noise, excess, objections, simplest
+from masiv.refine.evidence import above_noise, excess, objections
+from masiv.refine.naming import named
 from masiv.refine.noise import uncertainties
 from masiv.refine.refit import Fitted, carried, full_fit, held_in, ordered, reweighted, softness, strengths_alone
 from masiv.refine.rounds import TELLS_APART, Round, Trial, confusable
@@ -101,6 +102,7 @@ def _told_apart(current: Fitted, first: Round, looks: Sequence[Round]) -> Fitted
             first.accepted.reasons.append(f"{pair} together explain more")
             (name,) = set(done.base.model.effects) - set(first.base.model.effects)
             first.accepted = next(t for t in first.trials if t.candidate.effect == name and t.passes)
+            first.or_else = []
         return found
     return current
 
@@ -178,9 +180,8 @@ def _round(
         trial.reasons = _reasons(simulation, current, trial, config)
     for trial, reason in [(t, _outdone(simulation, current, t, trials, config)) for t in trials if t.passes]:
         trial.reasons += reason
-    chosen = simplest([t.fitted for t in trials if t.passes], simulation.experiments)
-    if chosen is not None:
-        trial = next(t for t in trials if t.fitted is chosen)
+    trial, or_else = named(trials, simulation.experiments, config)
+    if trial is not None:
         final = full_fit(
             simulation, trial.fitted.model, trial.fitted.values,
             budget=2 * len(trial.fitted.parameters) + 6, soft=soft, held=held_in(simulation, trial.fitted),
@@ -188,7 +189,7 @@ def _round(
         trial.fitted = _freed(simulation, min(final, trial.fitted, key=lambda f: f.cost), soft)
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
-    return Round(current, ranking, trials, accepted, alike)
+    return Round(current, ranking, trials, accepted, alike, or_else if accepted else [])
 
 
 def in_reach(candidate: Candidate, base: Fitted, trials: Sequence[Trial]) -> bool:
@@ -215,12 +216,15 @@ def _fitted(
 
 def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, say: Say, workers: Workers) -> None:
     """Fit what is simpler than the best trial, with the same law, again from where the best one ended: a flexible cause
-    that found the right law and launch must not win for that alone."""
+    that found the right law and launch must not win for that alone. So too what has a kink and is no richer: its
+    derivatives at a law that made up for it point to next to nothing."""
     best = trials[0].fitted
-    simpler = [
-        t for t in trials[1:]
-        if t.fitted.model.family.kind == best.model.family.kind and len(t.fitted.parameters) < len(best.parameters)
-    ]  # fmt: skip
+
+    def worth(trial: Trial) -> bool:
+        mine, its = len(trial.fitted.parameters), len(best.parameters)
+        return mine < its or (mine == its and simulation.term(trial.candidate.effect).kinked)
+
+    simpler = [t for t in trials[1:] if t.fitted.model.family.kind == best.model.family.kind and worth(t)]
     fits = side_by_side(
         workers, simulation, _fitted_from, [(t.fitted, t.candidate.effect, best, soft) for t in simpler]
     )
@@ -235,8 +239,9 @@ def _fitted_from(simulation: Simulated, fitted: Fitted, name: str, best: Fitted,
     shared = {p.name for p in fitted.parameters} & {p.name for p in best.parameters}
     values = {**fitted.values, **{n: best.values[n] for n in shared}}
     values = strengths_alone(simulation, fitted.model, values, simulation.term(name).strengths, soft)
-    held, budget = held_in(simulation, fitted), 2 * (len(fitted.parameters) + 2)
-    return full_fit(simulation, fitted.model, values, budget=budget, soft=soft, held=held)
+    # What has a kink is begun far from where it ends: four derivatives for two.
+    budget = (4 if simulation.term(name).kinked else 2) * (len(fitted.parameters) + 2)
+    return full_fit(simulation, fitted.model, values, budget=budget, soft=soft, held=held_in(simulation, fitted))
 
 
 def _freed(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:

@@ -35,18 +35,20 @@ class Proposal:
 
 
 def propose(simulation: Simulation, outcome: Outcome, progress: Progress) -> Proposal | None:
-    """A throw between the two best refits of the first round, where the data hardly tells them apart; else None."""
-    if not outcome.rounds or outcome.rounds[0].accepted is None:
+    """A throw between the first cause that was accepted and what may as well be there, or else the best other refit of
+    that round, where the data hardly tells them apart; else None."""
+    first = outcome.rounds[0] if outcome.rounds else None
+    if first is None or first.accepted is None:
         return None
-    fits = ordered([t.fitted for t in outcome.rounds[0].trials])
-    best = fits[0]
-    rivals = [f for f in fits[1:] if f.model.effects != best.model.effects]
+    best = first.accepted.fitted
+    rivals = ordered([t.fitted for t in first.trials if t.fitted.model.effects != best.model.effects])
+    as_well = [f for f in rivals if f.model.effects[-1] in first.or_else]
     if not rivals:
         return None
-    rival = rivals[0]
-    alike = outcome.rounds[0].confusable.get(best.model.effects[-1], [])
+    rival = (as_well or rivals)[0]
+    alike = first.confusable.get(best.model.effects[-1], [])
     close = rival.bic(best.samples) - best.bic(best.samples) < TELLS_APART
-    if not close and rival.model.effects[-1] not in alike:
+    if not as_well and not close and rival.model.effects[-1] not in alike:
         return None
     problem = simulation.experiments[0].problem
     suffix = f"@{simulation.experiments[0].name}"

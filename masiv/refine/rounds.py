@@ -28,13 +28,15 @@ class Trial:
 
 @dataclass
 class Round:
-    """One pass: what was tried on top of which model."""
+    """One pass: what was tried on top of which model. or_else: effects that may as well be there in place of the
+    accepted one, as far as this motion tells."""
 
     base: Fitted
     candidates: list[Candidate]
     trials: list[Trial]
     accepted: Trial | None
     confusable: dict[str, list[str]]
+    or_else: list[str] = field(default_factory=list)
 
 
 def confusable(ranking: Sequence[Candidate], trials: Sequence[Trial], least: float) -> dict[str, list[str]]:
@@ -56,7 +58,11 @@ def confusable(ranking: Sequence[Candidate], trials: Sequence[Trial], least: flo
     return {name: sorted(others) for name, others in out.items()}
 
 
-def like_accepted(name: str, rounds: Sequence[Round]) -> list[str]:
-    """What explains the motion as well as the term ``name``, in the round that accepted it."""
-    found = (r for r in rounds if r.accepted is not None and r.accepted.candidate.effect == name)
-    return next((r.confusable.get(name, []) for r in found), [])
+def like_accepted(name: str, rounds: Sequence[Round]) -> dict[str, list[str]]:
+    """What is like the term ``name`` in the round that accepted it: whose pattern is (confusable_with), and what may as
+    well be there in its place (or_else)."""
+    found = [r for r in rounds if r.accepted is not None and r.accepted.candidate.effect == name]
+    return {
+        "confusable_with": found[0].confusable.get(name, []) if found else [],
+        "or_else": found[0].or_else if found else [],
+    }

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
+from masiv.refine.answer import answer
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess
 from masiv.refine.loop import STOP_GAP
@@ -45,7 +46,7 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
         "residual_mm": {"fit": outcome.before.fit_mm, "held_out": outcome.before.held_out_mm},
         "candidates": [_candidate(c, first) for c in first.candidates] if first else [],
         "accepted": [
-            {**_accepted(name, outcome.after), "confusable_with": like_accepted(name, outcome.rounds)}
+            {**_accepted(name, outcome.after), **like_accepted(name, outcome.rounds)}
             for name in outcome.after.model.effects
         ],
         "stop_gap": None if outcome.gap is None else _stop_gap(outcome.gap),
@@ -201,7 +202,7 @@ def text(document: dict[str, Any]) -> str:
             f"{' and '.join(n['tells_apart'])} look alike here; a throw at {_vector(n['velocity'])} m/s with spin "
             f"{_vector(n['omega'])} rad/s would set them {n['predicted_difference_mm']:.0f} mm apart"
         )
-    return "\n".join([*lines, document["verdict"]])
+    return "\n".join([*lines, answer(document)])
 
 
 def _looks_like(others: list[str]) -> str:

@@ -11,6 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from masiv.errors import InputError
+from masiv.refine.answer import answer
 from masiv.report import plots
 from masiv.report.page import Page, Share, number
 
@@ -63,7 +64,6 @@ def refine_section(run: Path, up: np.ndarray | None = None) -> str | None:
 
 
 def _verdict(document: Mapping[str, Any]) -> str:
-    names = ", ".join(_words(entry["effect"]) for entry in document["accepted"])
     laws = document["laws"]
     law = _words(laws["before"])
     if laws["after"] != laws["before"]:
@@ -74,7 +74,7 @@ def _verdict(document: Mapping[str, Any]) -> str:
         if document["before"].get(split)
     ]
     return (
-        f"Verdict: {document['verdict']}{': ' + names if names else ''}. Residual (simulated less observed) on "
+        f"Verdict: {answer(document)}. Residual (simulated less observed) on "
         f"{', on '.join(errors)}; noise floor of the observation {number(document['noise_floor_mm'])} mm. "
         f"Classical law with its best parameters: {law}. {document['rollouts']} rollouts."
     )
@@ -178,7 +178,7 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
         return
     page.subheading("What was added")
     page.table(
-        ["effect", "parameter", "value", "standard error", "unit", "looks like"],
+        ["effect", "parameter", "value", "standard error", "unit", "may as well be", "looks like"],
         [
             [
                 _words(a["effect"]),
@@ -186,6 +186,7 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
                 _number(value),
                 _number(a["stderr"].get(n)),
                 _unit(a["unit"].get(n, "")),
+                ", ".join(map(_words, a.get("or_else", []))) or None,
                 ", ".join(map(_words, a.get("confusable_with", []))),
             ]
             for a in accepted

@@ -121,7 +121,7 @@ def _accepted(found: Found, term: Term) -> dict[str, Any]:
         "theta": {_short(term, p.name): after.values[p.name] for p in term.parameters},
         "stderr": {_short(term, p.name): after.stderr.get(p.name) for p in term.parameters},
         "unit": {_short(term, p.name): term.units[p.name] for p in term.parameters},
-        "confusable_with": like_accepted(term.name, found.outcome.rounds),
+        **like_accepted(term.name, found.outcome.rounds),
     }
     if isinstance(found, Refined) and (place := place_of(found.simulation, term.name, after)) is not None:
         out["place_in_body"] = {"value": list(place), "unit": "m"}

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from masiv.refine.answer import answer
 from masiv.report.page import Page, Share
 from masiv.tracks.tracks import Tracks
 from masiv.tracks.twin import TracksTwin
@@ -53,8 +54,7 @@ def write_page(
 def _section(page: Page, document: Mapping[str, Any]) -> None:
     title = "What does the model lack?"
     page.heading(f"{title} Condition {document['condition']}" if document.get("condition") else title)
-    accepted = ", ".join(a["effect"].replace("_", " ") for a in document["accepted"])
-    page.note(f"Verdict: {document['verdict']}{': ' + accepted if accepted else ''}.")
+    page.note(f"Verdict: {answer(document)}.")
     page.table(
         ["effect", "explained", "strength", "unit", "looks like"],
         [

@@ -1,0 +1,23 @@
+"""What refine says it found, in words, from refine.json. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def answer(document: Mapping[str, Any]) -> str:
+    """The verdict with what was accepted, and where the motion does not tell one cause from others, with these."""
+    names = ", ".join(map(_named, document["accepted"]))
+    return f"{document['verdict']}{': ' + names if names else ''}"
+
+
+def _named(entry: Mapping[str, Any]) -> str:
+    others = entry.get("or_else")
+    if not others:
+        return _words(entry["effect"])
+    return f"one of {', '.join(map(_words, [entry['effect'], *others]))} (this motion does not tell which)"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")

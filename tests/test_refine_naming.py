@@ -1,0 +1,70 @@
+"""Which cause is named, and which the motion does not tell from it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from masiv.refine import naming
+from masiv.refine.answer import answer
+from masiv.refine.config import RefineConfig
+from masiv.refine.rounds import Trial
+
+FITTED, ALL, NOISE = 4, 6, 1e-3
+WATCHED = [SimpleNamespace(noise=NOISE, sigma=np.full(ALL, NOISE), rows=FITTED, holds_out=True, instants=ALL)]
+
+
+def trial(effect, fitted, held_out, count=9, passes=True):
+    """A refit with these mean squares, in units of the noise, and ``count`` parameters."""
+    squares = NOISE**2 * np.repeat([float(fitted), float(held_out)], [FITTED, ALL - FITTED])
+    fit = SimpleNamespace(
+        squares=[squares], values=dict.fromkeys(range(count)), cost=fitted, samples=100,
+        bic=lambda samples: samples * np.log(fitted) + count * np.log(samples),
+    )  # fmt: skip
+    return Trial(SimpleNamespace(effect=effect), fit, [] if passes else ["it does not"])
+
+
+@pytest.fixture(autouse=True)
+def apart(monkeypatch):
+    """Told apart by ten sigmas for each noise of mean square."""
+    monkeypatch.setattr(naming, "told_apart", lambda a, b, _: 10 * (b.cost - a.cost))
+
+
+def named(*trials):
+    first, others = naming.named(trials, WATCHED, RefineConfig())
+    return first and first.candidate.effect, others
+
+
+def test_the_one_that_explains_most_where_the_others_explain_less():
+    assert named(trial("drag", 1.0, 5), trial("swirl", 2.0, 1)) == ("drag", [])
+    assert named(trial("drag", 1.0, 5, passes=False), trial("swirl", 2.0, 1)) == ("swirl", [])
+    assert named(trial("drag", 1.0, 5, passes=False)) == (None, [])
+    assert named() == (None, [])
+
+
+def test_of_causes_that_explain_as_much_the_one_that_predicts_best_and_the_others_beside_it():
+    assert named(trial("quadratic", 1.0, 5), trial("linear", 1.1, 4)) == ("linear", ["quadratic"])
+    assert named(trial("quadratic", 1.0, 3), trial("linear", 1.1, 4), trial("force", 1.15, 9)) == (
+        "quadratic", ["linear", "force"]
+    )  # fmt: skip
+
+
+def test_a_richer_cause_is_no_rival_unless_that_pays():
+    assert named(trial("linear", 1.0, 5), trial("force", 0.99, 1, count=12)) == ("linear", [])
+    better = trial("force", 0.7, 5, count=12)
+    assert named(better, trial("linear", 0.85, 4, count=11)) == ("linear", ["force"])
+
+
+def test_a_cause_is_no_rival_of_itself_beside_another_law():
+    assert named(trial("drag", 1.0, 5), trial("drag", 1.05, 4)) == ("drag", [])
+
+
+def test_the_answer_says_what_the_motion_does_not_tell():
+    document = {"verdict": "effect added", "accepted": [{"effect": "linear_drag", "or_else": ["quadratic_drag"]}]}
+    assert answer(document) == (
+        "effect added: one of linear drag, quadratic drag (this motion does not tell which)"
+    )  # fmt: skip
+    assert answer(document | {"accepted": [{"effect": "swirl"}]}) == "effect added: swirl"
+    assert answer(document | {"verdict": "nothing missing", "accepted": []}) == "nothing missing"
