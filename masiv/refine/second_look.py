@@ -3,7 +3,7 @@
 A uniform force takes over the drag that acts beside it, and quadratic drag a linear one with viscosity, so well that
 what is left is hardly more than the noise. A ranking on top of the first cause still sees the other, if on top of the
 right one: so it is looked for beside the accepted cause and beside the one that came closest to it. That near to the
-noise only a cause of one number is looked for, which cannot adapt to an error of any shape.
+noise only a cause of one number is added to the accepted one, since it cannot adapt to an error of any shape.
 """
 
 from __future__ import annotations
@@ -60,6 +60,9 @@ def _round(
     beside = ", ".join(base.model.effects)
     names = [n for n in simulation.candidates(base.model) if len(simulation.term(n).parameters) == 1]
     names = [n for n in names if n in config.effects or not config.effects]
+    if len(simulation.term(base.model.effects[-1]).parameters) > 1:
+        # A rival of many numbers with the accepted cause beside it is that cause with many numbers beside it.
+        names = [n for n in names if n not in best.model.effects]
     label = f"refine: rank what may act beside {beside}"
     candidates = ranked(
         workers, simulation, base, soft=soft, names=names, progress=lambda n, i, k: say(label, i, k, n)
