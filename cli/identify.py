@@ -84,7 +84,7 @@ def identify(
     )
     stages.start(settings)
     from masiv.mpm.simulate import simulate
-    from masiv.report.numbers import run_numbers, table
+    from masiv.report.numbers import material_numbers, run_numbers, table
     from masiv.report.report import write_report
     from masiv.runfolder import write_json
 
@@ -92,9 +92,11 @@ def identify(
         dynamic = stages.reconstructed(run, settings, read, progress)
         trajectory = stages.estimated(run, settings, read, progress)
         twin = stages.identified(run, settings, read, progress)
-        motion = simulate(twin, frames=read.frame_count, fps=read.fps, progress=progress)
-        motion.save(run.rollout)
-        numbers = run_numbers(run, read, dynamic, trajectory, motion.positions)
+        with stages.described(run, settings, twin):
+            motion = simulate(twin, frames=read.frame_count, fps=read.fps, progress=progress)
+            motion.save(run.rollout)
+            numbers = run_numbers(run, read, dynamic, trajectory, motion.positions)
+        numbers |= material_numbers(run)
         write_json(run.metrics, numbers)
         progress("report", 0, 1)
         write_report(run, read, dynamic, trajectory, twin, motion.positions, numbers)

@@ -117,7 +117,7 @@ def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: P
     """Write report.html, and before it what the run lacks of rollout, material.json and metrics.json."""
     from masiv.mpm.simulate import simulate
     from masiv.report.material import MATERIAL
-    from masiv.report.numbers import run_numbers
+    from masiv.report.numbers import material_numbers, run_numbers
     from masiv.report.report import write_report
     from masiv.runfolder import load_motion
     from masiv.twin import Twin
@@ -130,7 +130,8 @@ def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: P
     if not (run.path / MATERIAL).is_file():
         stages.describe(run, twin, progress)
     if not run.metrics.is_file():
-        write_json(run.metrics, run_numbers(run, scene, dynamic, trajectory, rollout))
+        numbers = run_numbers(run, scene, dynamic, trajectory, rollout)
+        write_json(run.metrics, numbers | material_numbers(run))
     numbers = json.loads(run.metrics.read_text(encoding="utf-8"))
     write_report(run, scene, dynamic, trajectory, twin, rollout, numbers)
     progress("report", 1, 1)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 from masiv import runtime
 from masiv.config import Config, load_config
 from masiv.errors import InputError
-from masiv.progress import Progress
+from masiv.progress import Progress, silent
 from masiv.report.history import logged
 from masiv.report.material import MATERIAL
 from masiv.runfolder import Request, RunFolder
@@ -162,16 +163,13 @@ def held_out_trajectory(run: RunFolder, config: Config, scene: Scene, progress: 
 
 
 def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Twin:
-    """The run's twin, made now where it lacks it, with material.json: what its law is in a tester's terms."""
+    """The run's twin, made now where it lacks it."""
     runtime.start(config.arch)
     from masiv.identify.stage import identify
     from masiv.twin import Twin
 
     if run.done("identify"):
-        twin = Twin.load(run.path)
-        if not (run.path / MATERIAL).is_file():
-            describe(run, twin, progress)
-        return twin
+        return Twin.load(run.path)
     trajectory = estimated(run, config, scene, progress)
     with run.stage("identify") as checkpoint:
         twin = identify(
@@ -183,12 +181,26 @@ def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress)
             checkpoint=checkpoint,
             progress=logged(progress, run.log),
         )
+        (run.path / MATERIAL).unlink(missing_ok=True)  # of an earlier twin
         twin.save(run.path)
-        describe(run, twin, progress)
     return twin
 
 
-def describe(run: RunFolder, twin: Twin, progress: Progress) -> None:
+@contextmanager
+def described(run: RunFolder, config: Config, twin: Twin) -> Iterator[None]:
+    """Beside what the body of this context does, in a process of its own, material.json is made where it lacks."""
+    from masiv.workers import Workers, demanded, processes_wanted
+
+    if (run.path / MATERIAL).is_file():
+        yield
+        return
+    with Workers(min(2, processes_wanted(config.identify.processes)), "identify.processes") as workers:
+        found = workers.beside(describe, (run, twin))
+        yield
+        demanded(found())
+
+
+def describe(run: RunFolder, twin: Twin, progress: Progress = silent) -> None:
     """Write material.json: what the law of ``twin`` is in a tester's terms."""
     from masiv.materials.describe import describe_twin
 

@@ -32,7 +32,8 @@ def start(arch: str = "cpu") -> Any:
     if arch not in known:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, where stdout may be for one JSON object
-        ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0)
+        # One of Taichi's own passes is half of a kernel's compilation, and LLVM does its work again.
+        ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, cfg_optimization=False)
     atexit.register(ti.reset)  # writes the kernel cache, which the next command starts from
     running = ti.lang.impl.current_cfg().arch
     if arch != "cpu" and running != known[arch]:

@@ -64,6 +64,11 @@ class Workers:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
 
+    def begin(self) -> None:
+        """Start the processes, where there are several, and go on: they take seconds to be ready for a task."""
+        if self.processes > 1:
+            self._started()
+
     def map(self, function: Callable, tasks: Iterable[tuple]) -> Iterator[Any]:
         """``function(*task)`` of each, in order, or ``Failed``. The function and its arguments must be picklable.
 

@@ -90,6 +90,21 @@ def test_a_tabulated_law_is_the_law():
     torch.testing.assert_close(known.stress(f), law.stress(f).detach(), rtol=0, atol=0)
 
 
+def test_an_exact_classical_law_finds_its_coefficients_once_a_step(monkeypatch):
+    asked, coefficients = [], ClassicalLaw.coefficients
+
+    def counted(law, dt):
+        asked.append(dt)
+        return coefficients(law, dt)
+
+    monkeypatch.setattr(ClassicalLaw, "coefficients", counted)
+    law = curves.exact(ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=1e3))
+    path = curves.simple_shear(np.linspace(0, 0.2, 5))[:, None]
+    slow, quick = (curves.drive(law, path, dt)[1] for dt in (1e-3, 1e-4))
+    assert asked == [1e-3, 1e-4]
+    torch.testing.assert_close(slow, quick, rtol=0, atol=0)  # its yield knows no rate
+
+
 # ---- description ---------------------------------------------------------------------------------------------------
 
 

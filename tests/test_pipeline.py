@@ -3,6 +3,7 @@ filmed."""
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -86,11 +87,20 @@ def test_killed_run_ends_with_the_numbers_of_a_whole_one(folder, whole):
         first, second = (np.load(path / name)["positions"] for path in (whole, folder / "broken"))
         assert np.array_equal(first, second)
     assert (whole / "twin.yaml").read_bytes() == (folder / "broken/twin.yaml").read_bytes()
+    assert (whole / "material.json").read_bytes() == (folder / "broken/material.json").read_bytes()
     for name in ("gaussians.ply", "deformation.safetensors", "law.safetensors", "metrics.json", "report.html"):
         assert (folder / "broken" / name).stat().st_size > 0
     rollout = np.load(whole / "rollout.npz")
     assert rollout["positions"].shape[0] == len(rollout["times"]) == SPEC["frames"]
     assert rollout["positions"].dtype == np.float32
+
+
+def test_a_run_whose_material_is_missing_makes_it_again_and_nothing_else(folder, whole):
+    shutil.copytree(whole, folder / "again")
+    (folder / "again/material.json").unlink()
+    done(*identify(folder, "again"))
+    for name in ("material.json", "twin.yaml", "law.safetensors"):
+        assert (folder / "again" / name).read_bytes() == (whole / name).read_bytes()
 
 
 def test_evaluate_separates_observed_from_future(folder, whole):

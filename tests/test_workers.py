@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
 import os
 import pickle
 from typing import Any
@@ -19,7 +20,7 @@ from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.families import FAMILIES
 from masiv.identify.problem import Motion, Problem
-from masiv.identify.start import choose_start
+from masiv.identify.start import _effort, choose_start
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.baselines import DONE, baselines, derived
 from masiv.refine.config import RefineConfig
@@ -60,6 +61,18 @@ def quiet(*_):
     pass
 
 
+class Listening(Workers):
+    """heard: the tasks of each ``map``."""
+
+    def __init__(self):
+        super().__init__(1)
+        self.heard = []
+
+    def map(self, function, tasks):
+        self.heard.append(list(tasks))
+        return super().map(function, self.heard[-1])
+
+
 def test_results_come_in_order_and_a_failure_is_one_of_them(two):
     found = list(two.map(halved, [(k,) for k in range(10)]))
     assert [f[0] for f in found[::2]] == [0, 1, 2, 3, 4]
@@ -93,6 +106,14 @@ def test_a_task_beside_this_process(processes):
         assert isinstance(failing(), Failed)
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_processes_begin_before_they_are_asked_for_anything(processes):
+    before = len(multiprocessing.active_children())
+    with Workers(processes) as workers:
+        workers.begin()
+        assert (len(multiprocessing.active_children()) > before) == (processes > 1)
+
+
 def test_as_many_as_asked_or_as_there_are_cores():
     assert processes_wanted(3) == 3
     assert 1 <= processes_wanted(0) <= 4
@@ -106,8 +127,11 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
     problem = Problem(scene(), motion, config, SimulatorConfig(), particles=150, seed=0)
     throw = Motion.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
-    alone, beside = (choose_start(problem, throw, quiet, workers) for workers in (Workers(1), two))
+    listening = Listening()
+    alone, beside = (choose_start(problem, throw, quiet, workers) for workers in (listening, two))
     assert len(alone) == 2
+    efforts = [_effort(name, modulus) for _, _, name, _, _, modulus in listening.heard[1]]
+    assert efforts == sorted(efforts, reverse=True)  # or the longest search may begin last, alone
     for a, b in zip(alone, beside, strict=True):
         assert (a.material, a.contact, a.error) == (b.material, b.contact, b.error)
         for name, value in a.law.state_dict().items():

@@ -36,6 +36,7 @@ def learn(
         if "starts" in saved:
             starts = [_start_from(state) for state in saved["starts"]]
         else:
+            workers.begin()
             saved, starts = {}, _worth_fitting(choose_start(few(), motion, progress, workers))
         fixed: dict[str, Any] = {"starts": [_start_state(start) for start in starts]}
         keeper = _With(checkpoint, fixed)

@@ -84,12 +84,13 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: 
     if min(best.values())[0] >= DIVERGED:
         raise MasivError("identify: every starting law diverges; check the scene's ground, gravity and units")
     ranked = sorted(best, key=lambda name: best[name])[:REFINED]
-    searched = workers.map(_searched, [(problem, motion, name, contacts, *best[name]) for name in ranked])
-    starts = []
-    for done, (name, (contact, logs, error)) in enumerate(zip(ranked, map(demanded, searched), strict=True)):
-        starts.append(Start(name, contact, with_scales(_law(name), best[name][1], logs), error))
+    longest_first = sorted(ranked, key=lambda name: -_effort(name, best[name][1]))
+    searched = workers.map(_searched, [(problem, motion, name, contacts, *best[name]) for name in longest_first])
+    starts = {}
+    for done, (name, (contact, logs, error)) in enumerate(zip(longest_first, map(demanded, searched), strict=True)):
+        starts[name] = Start(name, contact, with_scales(_law(name), best[name][1], logs), error)
         progress("identify: start", done + 1, len(ranked), f"{name}, {contact}: {said(error)}")
-    return best_first(starts)
+    return best_first([starts[name] for name in ranked])
 
 
 def best_first(starts: Sequence[Start]) -> list[Start]:
@@ -131,6 +132,11 @@ def _searched(
         options={"initial_simplex": simplex, "maxfev": 12 * len(moved), "xatol": 0.02, "fatol": 1e-4},
     )  # fmt: skip
     return contact, logs(found.x), float(found.fun)
+
+
+def _effort(name: str, modulus: float) -> float:
+    """How long ``_searched`` takes, beside others: rollouts times substeps, which grow with the speed of sound."""
+    return np.count_nonzero(SEARCHED.get(name, FLOWS)) * math.sqrt(modulus)
 
 
 @functools.lru_cache

@@ -39,15 +39,20 @@ class ClassicalKernels:
                 out[p, c] = self.coefficients.grad[p][c]
 
     @ti.func
-    def particle(self, s: ti.i32, p: ti.i32):
+    def flow_particle(self, s: ti.i32, p: ti.i32):
+        """The stress, too: both come from one decomposition of the strain."""
         f, tau = self.law(self.mpm.trial_gradient[s, p], self.coefficients[p])
         self.mpm.deformation_gradient[s, p] = f
         self.mpm.kirchhoff_stress[s, p] = tau
 
+    @ti.func
+    def stress_particle(self, s: ti.i32, p: ti.i32):
+        """Nothing is left to do."""
+
     @ti.kernel
     def forward(self, s: ti.i32, count: ti.i32):
         for p in range(count):
-            self.particle(s, p)
+            self.flow_particle(s, p)
 
     @ti.kernel
     def pointwise(self, count: ti.i32):
@@ -89,14 +94,14 @@ class InvariantKernels:
     @ti.kernel
     def trial_invariants(self, s: ti.i32, out: ti.types.ndarray()):
         for p in range(out.shape[0]):
-            value = tensor.invariants(self.mpm.trial_gradient[s, p])
+            value = tensor.invariants(tensor.isochoric_strain(self.mpm.trial_gradient[s, p]))
             for a in ti.static(range(3)):
                 out[p, a] = value[a]
 
     @ti.kernel
     def final_invariants(self, s: ti.i32, out: ti.types.ndarray()):
         for p in range(out.shape[0]):
-            value = tensor.invariants(self.mpm.deformation_gradient[s, p])
+            value = tensor.invariants(tensor.isochoric_strain(self.mpm.deformation_gradient[s, p]))
             for a in ti.static(range(3)):
                 out[p, a] = value[a]
 
@@ -104,9 +109,10 @@ class InvariantKernels:
     def flow(self, s: ti.i32, share: ti.types.ndarray(), out: ti.types.ndarray()):
         """Apply the flow, and give the invariants (N, 3) of what is left."""
         for p in range(out.shape[0]):
-            f = tensor.neural_flow(self.mpm.trial_gradient[s, p], ti.Vector([share[p, 0], share[p, 1]]))
+            trial, c = self.mpm.trial_gradient[s, p], ti.Vector([share[p, 0], share[p, 1]])
+            f = tensor.neural_flow(trial, tensor.isochoric_strain(trial), c)
             self.mpm.deformation_gradient[s, p] = f
-            value = tensor.invariants(f)
+            value = tensor.invariants(tensor.isochoric_strain(f))
             for a in ti.static(range(3)):
                 out[p, a] = value[a]
 
@@ -114,15 +120,18 @@ class InvariantKernels:
     def elastic(self, s: ti.i32, moduli: ti.types.ndarray()):
         for p in range(moduli.shape[0]):
             c = ti.Vector([moduli[p, 0], moduli[p, 1], moduli[p, 2], moduli[p, 3]])
-            self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(self.mpm.deformation_gradient[s, p], c)
+            strain = tensor.isochoric_strain(self.mpm.deformation_gradient[s, p])
+            self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(strain, c)
 
     @ti.kernel
     def elastic_adjoint(self, s: ti.i32, moduli: ti.types.ndarray(), moduli_bar: ti.types.ndarray()):
         """``stress_bar`` -> added to ``gradient_bar``, and moduli_bar (N, 4)."""
         for p in range(moduli.shape[0]):
             c = ti.Vector([moduli[p, 0], moduli[p, 1], moduli[p, 2], moduli[p, 3]])
-            f_bar, c_bar = tensor.neural_stress_adjoint(self.mpm.deformation_gradient[s, p], c, self.mpm.stress_bar[p])
-            self.mpm.gradient_bar[p] += f_bar
+            f = self.mpm.deformation_gradient[s, p]
+            strain = tensor.isochoric_strain(f)
+            c_bar, log_j_bar, b_bar, b_inverse_bar = tensor.neural_stress_adjoint(strain, c, self.mpm.stress_bar[p])
+            self.mpm.gradient_bar[p] += tensor.strain_adjoint(f, strain, log_j_bar, b_bar, b_inverse_bar)
             for a in ti.static(range(4)):
                 moduli_bar[p, a] = c_bar[a]
 
@@ -132,11 +141,12 @@ class InvariantKernels:
     ):
         """``gradient_bar`` and the adjoint (N, 3) of the final invariants -> ``trial_bar``, and share_bar (N, 2)."""
         for p in range(share.shape[0]):
+            trial, out = self.mpm.trial_gradient[s, p], self.mpm.deformation_gradient[s, p]
             bar = ti.Vector([final_bar[p, 0], final_bar[p, 1], final_bar[p, 2]])
-            out_bar = self.mpm.gradient_bar[p] + tensor.invariants_adjoint(self.mpm.deformation_gradient[s, p], bar)
-            c = ti.Vector([share[p, 0], share[p, 1]])
-            f_bar, c_bar = tensor.neural_flow_adjoint(self.mpm.trial_gradient[s, p], c, out_bar)
-            self.mpm.trial_bar[p] = f_bar
+            out_bar = self.mpm.gradient_bar[p] + tensor.invariants_adjoint(out, bar)
+            c, strain = ti.Vector([share[p, 0], share[p, 1]]), tensor.isochoric_strain(trial)
+            c_bar, f_bar, log_j_bar, b_bar, b_inverse_bar = tensor.neural_flow_adjoint(trial, strain, c, out, out_bar)
+            self.mpm.trial_bar[p] = f_bar + tensor.strain_adjoint(trial, strain, log_j_bar, b_bar, b_inverse_bar)
             for a in ti.static(range(2)):
                 share_bar[p, a] = c_bar[a]
 

@@ -154,46 +154,73 @@ class NeuralKernels:
     @ti.func
     def share(self, flow):
         """1 - exp(-flow), also where that is below the rounding of 1."""
-        return ti.select(flow < 0.01, flow * (1.0 - 0.5 * flow * (1.0 - flow / 3.0)), 1.0 - ti.exp(-flow))
+        out = flow * (1.0 - 0.5 * flow * (1.0 - flow / 3.0))
+        for a in ti.static(range(2)):
+            if flow[a] >= 0.01:
+                out[a] = 1.0 - ti.exp(-flow[a])
+        return out
 
     # ---- the law -------------------------------------------------------------------------------------------------
 
     @ti.func
-    def particle(self, s: ti.i32, p: ti.i32):
+    def flow_particle(self, s: ti.i32, p: ti.i32):
+        """Trial gradient -> elastic gradient."""
         trial = self.mpm.trial_gradient[s, p]
-        cell, inside, _ = self.locate(self.features(tensor.invariants(trial), self.strains[1]))
+        strain = tensor.isochoric_strain(trial)
+        cell, inside, _ = self.locate(self.features(tensor.invariants(strain), self.strains[1]))
         flow = self.sample(self.flows, ti.Vector.zero(self.mpm.real, 2), cell, inside)
-        f = tensor.neural_flow(trial, self.share(flow))
-        cell, inside, _ = self.locate(self.features(tensor.invariants(f), self.strains[0]))
+        self.mpm.deformation_gradient[s, p] = tensor.neural_flow(trial, strain, self.share(flow))
+
+    @ti.func
+    def stress_particle(self, s: ti.i32, p: ti.i32):
+        """Elastic gradient -> stress."""
+        strain = tensor.isochoric_strain(self.mpm.deformation_gradient[s, p])
+        cell, inside, _ = self.locate(self.features(tensor.invariants(strain), self.strains[0]))
         c = self.coefficients(self.sample(self.moduli, ti.Vector.zero(self.mpm.real, 4), cell, inside))
-        self.mpm.deformation_gradient[s, p] = f
-        self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(f, c)
+        self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(strain, c)
 
     @ti.kernel
     def forward(self, s: ti.i32, count: ti.i32):
         for p in range(count):
-            self.particle(s, p)
+            self.flow_particle(s, p)
+            self.stress_particle(s, p)
 
     @ti.func
-    def particle_adjoint(self, t: ti.i32, s: ti.i32, p: ti.i32):
-        f, trial = self.mpm.deformation_gradient[s, p], self.mpm.trial_gradient[s, p]
-        # Stress.
-        final = tensor.invariants(f)
+    def stress_particle_adjoint(self, t: ti.i32, s: ti.i32, p: ti.i32):
+        """Adds the stress's part to ``gradient_bar``."""
+        f = self.mpm.deformation_gradient[s, p]
+        strain = tensor.isochoric_strain(f)
+        final = tensor.invariants(strain)
         cell, inside, slope = self.locate(self.features(final, self.strains[0]))
         c = self.coefficients(self.sample(self.moduli, ti.Vector.zero(self.mpm.real, 4), cell, inside))
-        f_bar, c_bar = tensor.neural_stress_adjoint(f, c, self.mpm.stress_bar[p])
+        c_bar, log_j_bar, b_bar, b_inverse_bar = tensor.neural_stress_adjoint(strain, c, self.mpm.stress_bar[p])
         moduli_bar = ti.Vector([c_bar[0] * c[0], c_bar[1] * c[1], c_bar[2] * c[2], c_bar[3]])
         feature_bar = self.sample_adjoint(self.moduli, self.moduli_bar, t, cell, inside, slope, moduli_bar)
-        invariants_bar, _ = self.features_adjoint(final, self.strains[0], feature_bar)
-        out_bar = self.mpm.gradient_bar[p] + f_bar + tensor.invariants_adjoint(f, invariants_bar)
-        # Flow.
-        before = tensor.invariants(trial)
+        bar, _ = self.features_adjoint(final, self.strains[0], feature_bar)
+        self.mpm.gradient_bar[p] += tensor.strain_adjoint(
+            f, strain, log_j_bar + bar[0],
+            b_bar + bar[1] * tensor.identity3(), b_inverse_bar + bar[2] * tensor.identity3(),
+        )  # fmt: skip
+
+    @ti.func
+    def flow_particle_adjoint(self, t: ti.i32, s: ti.i32, p: ti.i32):
+        """``gradient_bar`` -> ``trial_bar``."""
+        trial, f = self.mpm.trial_gradient[s, p], self.mpm.deformation_gradient[s, p]
+        strain = tensor.isochoric_strain(trial)
+        before = tensor.invariants(strain)
         cell, inside, slope = self.locate(self.features(before, self.strains[1]))
         flow = self.sample(self.flows, ti.Vector.zero(self.mpm.real, 2), cell, inside)
-        trial_bar, share_bar = tensor.neural_flow_adjoint(trial, self.share(flow), out_bar)
-        feature_bar = self.sample_adjoint(self.flows, self.flows_bar, t, cell, inside, slope, share_bar * ti.exp(-flow))
-        invariants_bar, strain_bar = self.features_adjoint(before, self.strains[1], feature_bar)
-        self.mpm.trial_bar[p] = trial_bar + tensor.invariants_adjoint(trial, invariants_bar)
+        share = self.share(flow)
+        share_bar, trial_bar, log_j_bar, b_bar, b_inverse_bar = tensor.neural_flow_adjoint(
+            trial, strain, share, f, self.mpm.gradient_bar[p]
+        )
+        flow_bar = share_bar * (1.0 - share)
+        feature_bar = self.sample_adjoint(self.flows, self.flows_bar, t, cell, inside, slope, flow_bar)
+        bar, strain_bar = self.features_adjoint(before, self.strains[1], feature_bar)
+        self.mpm.trial_bar[p] = trial_bar + tensor.strain_adjoint(
+            trial, strain, log_j_bar + bar[0],
+            b_bar + bar[1] * tensor.identity3(), b_inverse_bar + bar[2] * tensor.identity3(),
+        )  # fmt: skip
         self.flow_strain_bar[p] += strain_bar
 
     @ti.kernel
@@ -201,9 +228,13 @@ class NeuralKernels:
         """``gradient_bar`` and ``stress_bar`` -> ``trial_bar``; adjoints of the tables are added up."""
         if ti.static(self.mpm.gpu):
             for p in range(count):
-                self.particle_adjoint(0, s, p)
+                self.stress_particle_adjoint(0, s, p)
+                self.flow_particle_adjoint(0, s, p)
         else:
             ti.loop_config(block_dim=1)
             for t in range(self.mpm.chunks):
+                # Two loops: what a particle computes is one long chain, and a core works at several short ones at once.
                 for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
-                    self.particle_adjoint(t, s, p)
+                    self.stress_particle_adjoint(t, s, p)
+                for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
+                    self.flow_particle_adjoint(t, s, p)

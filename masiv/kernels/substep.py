@@ -9,8 +9,9 @@ import taichi as ti
 
 @ti.data_oriented
 class SubstepKernels:
-    """law: kernels with a Taichi function ``particle(s, p)``, trial gradient -> elastic gradient and stress.
-    serial: ``advance`` runs on one thread; the result is the same but for rounding."""
+    """law: kernels with Taichi functions ``flow_particle(s, p)``, trial gradient -> elastic gradient, and
+    ``stress_particle(s, p)``, from there to the stress. serial: ``advance`` runs on one thread; the result is the same
+    but for rounding."""
 
     def __init__(self, mpm, law, serial: bool):
         self.mpm = mpm
@@ -22,8 +23,11 @@ class SubstepKernels:
         """Law and P2G of chunk t of the particles."""
         for n in range(nodes):
             self.mpm.private[t, n] = ti.Vector.zero(self.mpm.real, 4)
+        # Two loops: what a particle computes is one long chain, and a core works at several short ones at once.
         for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
-            self.law.particle(s, p)
+            self.law.flow_particle(s, p)
+        for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
+            self.law.stress_particle(s, p)
             self.mpm.p2g_particle(t, s, p)
 
     @ti.func

@@ -27,93 +27,105 @@ def power_of_third(x, n: ti.template()):
 
 @ti.func
 def isochoric_strain(f):
-    """det F, the isochoric left Cauchy-Green tensor J^(-2/3) F F^T, and its inverse."""
+    """(J^(-2/3), J, ln J, b, b^-1) with J = det F and b = J^(-2/3) F F^T, the isochoric left Cauchy-Green tensor.
+
+    Functions of a law in invariants take this in place of F: it is most of their cost."""
     j = f.determinant()
-    b = power_of_third(j, -2) * (f @ f.transpose())
-    return j, b, b.inverse()
+    log_j = ti.log(j)
+    shrink = ti.exp(-2.0 * log_j / 3.0)
+    b = shrink * (f @ f.transpose())
+    return shrink, j, log_j, b, adjugate(b)  # det b = 1
 
 
 @ti.func
-def neural_stress(f, c):
+def strain_adjoint(f, strain, log_j_bar, b_bar, b_inverse_bar):
+    """Adjoint of F in ``isochoric_strain``, from those of ln J, b and b^-1, the last two symmetric."""
+    shrink, b, b_inverse = strain[0], strain[3], strain[4]
+    along = log_j_bar - 2.0 * ((b_bar * b).sum() - (b_inverse_bar * b_inverse).sum()) / 3.0
+    return shrink * ((2.0 * (b_bar - sandwich(b_inverse, b_inverse_bar)) + along * b_inverse) @ f)
+
+
+@ti.func
+def neural_stress(strain, c):
     """Kirchhoff stress from coefficients c = (g1, g2, kappa, m) [Pa]:
-    g1 dev(b) - g2 dev(b^-1) + (kappa (J - 1/J)/2 + m (tr b - 3)) I, b isochoric. Zero at F = I whatever c is."""
-    j, b, b_inverse = isochoric_strain(f)
+    g1 dev(b) - g2 dev(b^-1) + (kappa (J - 1/J)/2 + m (tr b - 3)) I. Zero at F = I whatever c is."""
+    j, b, b_inverse = strain[1], strain[3], strain[4]
     pressure = c[2] * 0.5 * (j - 1.0 / j) + c[3] * (b.trace() - 3.0)
     return c[0] * deviator(b) - c[1] * deviator(b_inverse) + pressure * identity3()
 
 
 @ti.func
-def neural_flow(f, c):
+def neural_stress_adjoint(strain, c, stress_bar):
+    """Adjoints of c, ln J, b and b^-1 in ``neural_stress``."""
+    j, b, b_inverse = strain[1], strain[3], strain[4]
+    trace = stress_bar.trace()
+    dev = symmetric_part(deviator(stress_bar))
+    c_bar = ti.Vector(
+        [(b * dev).sum(), -(b_inverse * dev).sum(), 0.5 * (j - 1.0 / j) * trace, (b.trace() - 3.0) * trace]
+    )
+    return c_bar, 0.5 * c[2] * (j + 1.0 / j) * trace, c[0] * dev + (c[3] * trace) * identity3(), -c[1] * dev
+
+
+@ti.func
+def cayley(h):
+    """(I + H)^-1, (I - H)^-1 and ln det((I + H)^-1 (I - H)) of a symmetric H without a trace."""
+    square = symmetric_product(h, h)
+    even, odd = 1.0 - 0.5 * square.trace(), (h * square).sum() / 3.0  # det(I + H) = even + odd
+    outer = square + even * identity3()
+    return (outer - h) / (even + odd), (outer + h) / (even - odd), ti.log((even - odd) / (even + odd))
+
+
+@ti.func
+def flow_direction(strain):
+    """dev(b - b^-1), and sqrt(1 + q/3) / 8 that divides it, with q = (tr b + tr b^-1 - 6)/2."""
+    b, b_inverse = strain[3], strain[4]
+    q = 0.5 * (b.trace() + b_inverse.trace()) - 3.0
+    return deviator(b - b_inverse), 0.125 / ti.sqrt(1.0 + q / 3.0)
+
+
+@ti.func
+def neural_flow(f, strain, c):
     """Elastic F after a share c[0] of its isochoric and c[1] of its volumetric Hencky strain has flowed.
 
     F <- J^(-c1/3) M F with M the Cayley map of Gamma = c0/4 dev(b - b^-1) / sqrt(1 + q/3), q = (tr b + tr b^-1 - 6)/2,
     scaled to det M = 1: the exponential return mapping of finite plasticity to third order (Simo 1992). F = I is kept.
     """
-    j, b, b_inverse = isochoric_strain(f)
-    q = 0.5 * (b.trace() + b_inverse.trace()) - 3.0
-    half = (0.125 * c[0] / ti.sqrt(1.0 + q / 3.0)) * deviator(b - b_inverse)
-    m = (identity3() + half).inverse() @ (identity3() - half)
-    return (power_of_third(m.determinant(), -1) * ti.pow(j, -c[1] / 3.0)) * (m @ f)
+    direction, per_share = flow_direction(strain)
+    below, _, log_det = cayley((c[0] * per_share) * direction)
+    scale = ti.exp(-(log_det + c[1] * strain[2]) / 3.0)
+    return scale * ((2.0 * below - identity3()) @ f)
 
 
 @ti.func
-def isochoric_adjoint(f, j, b, b_bar, j_bar):
-    """Adjoint of (J, b) = (det F, J^(-2/3) F F^T) with respect to F."""
-    along_j = j_bar * j - 2.0 * (b_bar * b).sum() / 3.0
-    return power_of_third(j, -2) * ((b_bar + b_bar.transpose()) @ f) + along_j * f.inverse().transpose()
-
-
-@ti.func
-def neural_stress_adjoint(f, c, stress_bar):
-    """Adjoints of F and c in ``neural_stress``."""
-    j, b, b_inverse = isochoric_strain(f)
-    trace = stress_bar.trace()
-    dev = deviator(stress_bar)
-    c_bar = ti.Vector(
-        [(b * dev).sum(), -(b_inverse * dev).sum(), 0.5 * (j - 1.0 / j) * trace, (b.trace() - 3.0) * trace]
-    )
-    b_bar = c[0] * dev + c[1] * (b_inverse @ dev @ b_inverse) + (c[3] * trace) * identity3()
-    j_bar = 0.5 * c[2] * (1.0 + 1.0 / (j * j)) * trace
-    return isochoric_adjoint(f, j, b, b_bar, j_bar), c_bar
-
-
-@ti.func
-def neural_flow_adjoint(f, c, out_bar):
-    """Adjoints of F and c in ``neural_flow``, from that of its result."""
-    j, b, b_inverse = isochoric_strain(f)
-    q = 0.5 * (b.trace() + b_inverse.trace()) - 3.0
-    per_share = 0.125 / ti.sqrt(1.0 + q / 3.0)
-    direction = deviator(b - b_inverse)
-    half = (c[0] * per_share) * direction
-    a_inverse = (identity3() + half).inverse()
-    m = a_inverse @ (identity3() - half)
-    scale = power_of_third(m.determinant(), -1) * ti.pow(j, -c[1] / 3.0)
-    log_scale_bar = scale * (out_bar * (m @ f)).sum()
-    m_bar = scale * (out_bar @ f.transpose()) - (log_scale_bar / 3.0) * m.inverse().transpose()
-    half_bar = -1.0 * (a_inverse.transpose() @ m_bar @ (m.transpose() + identity3()))
+def neural_flow_adjoint(f, strain, c, out, out_bar):
+    """Adjoints of c, F where the strain is held, ln J, b and b^-1 in ``neural_flow``, whose result was ``out``."""
+    direction, per_share = flow_direction(strain)
+    factor = c[0] * per_share
+    below, above, log_det = cayley(factor * direction)
+    scale = ti.exp(-(log_det + c[1] * strain[2]) / 3.0)
+    log_scale_bar = (out_bar * out).sum()
+    # M = 2 (I + H)^-1 - I, so that dM = -2 (I + H)^-1 dH (I + H)^-1.
+    m_bar = symmetric_part(scale * (out_bar @ f.transpose()))
+    half_bar = (log_scale_bar / 3.0) * (below + above) - 2.0 * sandwich(below, m_bar)
     factor_bar = (half_bar * direction).sum()
-    q_bar = -factor_bar * c[0] * per_share / (6.0 + 2.0 * q)
-    push = (c[0] * per_share) * deviator(half_bar)
-    squared = b_inverse @ b_inverse
-    b_bar = push + b_inverse @ push @ b_inverse + (0.5 * q_bar) * (identity3() - squared)
-    j_bar = -log_scale_bar * c[1] / (3.0 * j)
-    f_bar = scale * (m.transpose() @ out_bar) + isochoric_adjoint(f, j, b, b_bar, j_bar)
-    return f_bar, ti.Vector([factor_bar * per_share, -log_scale_bar * ti.log(j) / 3.0])
+    # 64 per_share^2 = 1 / (1 + q/3)
+    q_bar = -factor_bar * factor * 64.0 * per_share * per_share / 6.0
+    push, same = factor * deviator(half_bar), (0.5 * q_bar) * identity3()
+    c_bar = ti.Vector([factor_bar * per_share, -log_scale_bar * strain[2] / 3.0])
+    f_bar = scale * ((2.0 * below - identity3()) @ out_bar)
+    return c_bar, f_bar, -log_scale_bar * c[1] / 3.0, push + same, same - push
 
 
 @ti.func
-def invariants(f):
+def invariants(strain):
     """(ln J, I1 - 3, I2 - 3) of the isochoric left Cauchy-Green tensor."""
-    j, b, b_inverse = isochoric_strain(f)
-    return ti.Vector([ti.log(j), b.trace() - 3.0, b_inverse.trace() - 3.0])
+    return ti.Vector([strain[2], strain[3].trace() - 3.0, strain[4].trace() - 3.0])
 
 
 @ti.func
 def invariants_adjoint(f, bar):
-    """Adjoint of F in ``invariants``."""
-    j, b, b_inverse = isochoric_strain(f)
-    b_bar = bar[1] * identity3() - bar[2] * (b_inverse @ b_inverse)
-    return isochoric_adjoint(f, j, b, b_bar, bar[0] / j)
+    """Adjoint of F in the ``invariants`` of its strain."""
+    return strain_adjoint(f, isochoric_strain(f), bar[0], bar[1] * identity3(), bar[2] * identity3())
 
 
 @ti.func
@@ -136,15 +148,29 @@ def symmetric(xx, xy, xz, yy, yz, zz):
 
 
 @ti.func
-def commuting_product(a, b):
-    """A B of symmetric matrices with the same eigenvectors, hence symmetric."""
+def symmetric_part(a):
+    return symmetric(
+        a[0, 0], 0.5 * (a[0, 1] + a[1, 0]), 0.5 * (a[0, 2] + a[2, 0]),
+        a[1, 1], 0.5 * (a[1, 2] + a[2, 1]), a[2, 2],
+    )  # fmt: skip
+
+
+@ti.func
+def sandwich(a, x):
+    """A X A of symmetric matrices."""
+    return symmetric_product(a @ x, a)
+
+
+@ti.func
+def symmetric_product(a, b):
+    """A B where both it and B are symmetric: of symmetric matrices, where they have the same eigenvectors."""
     return symmetric(
         a[0, 0] * b[0, 0] + a[0, 1] * b[0, 1] + a[0, 2] * b[0, 2],
         a[0, 0] * b[0, 1] + a[0, 1] * b[1, 1] + a[0, 2] * b[1, 2],
         a[0, 0] * b[0, 2] + a[0, 1] * b[1, 2] + a[0, 2] * b[2, 2],
-        a[0, 1] * b[0, 1] + a[1, 1] * b[1, 1] + a[1, 2] * b[1, 2],
-        a[0, 1] * b[0, 2] + a[1, 1] * b[1, 2] + a[1, 2] * b[2, 2],
-        a[0, 2] * b[0, 2] + a[1, 2] * b[1, 2] + a[2, 2] * b[2, 2],
+        a[1, 0] * b[0, 1] + a[1, 1] * b[1, 1] + a[1, 2] * b[1, 2],
+        a[1, 0] * b[0, 2] + a[1, 1] * b[1, 2] + a[1, 2] * b[2, 2],
+        a[2, 0] * b[0, 2] + a[2, 1] * b[1, 2] + a[2, 2] * b[2, 2],
     )
 
 
@@ -227,12 +253,12 @@ def hencky_strain(f):
     # ln V = artanh(Z), Z = X (2 I + X)^-1: a short series up to stretches of 0.87 and 1.15, and no eigenvectors.
     b = x + 2.0 * identity3()
     minors = adjugate(b)
-    z = commuting_product(x, minors) / (b[0, 0] * minors[0, 0] + b[0, 1] * minors[0, 1] + b[0, 2] * minors[0, 2])
-    z2 = commuting_product(z, z)
+    z = symmetric_product(x, minors) / (b[0, 0] * minors[0, 0] + b[0, 1] * minors[0, 1] + b[0, 2] * minors[0, 2])
+    z2 = symmetric_product(z, z)
     j = f.determinant()
     strain = ti.zero(z)
     if z2.trace() < 0.02 and j > 0.0:
-        strain = commuting_product(z, power_series(z2, ARTANH))
+        strain = symmetric_product(z, power_series(z2, ARTANH))
     else:
         x = deviator(x)
         size = ti.sqrt(x.norm_sqr() / 6.0)
@@ -252,10 +278,10 @@ def strained(f, change):
     """exp(change) F: what F becomes when ``change``, which commutes with ln V, is added to its Hencky strain."""
     near = change.norm_sqr() < 0.004
     part = ti.select(near, 1.0, 1.0 / 64.0) * change
-    grown = commuting_product(part, power_series(part, EXPM1))
+    grown = symmetric_product(part, power_series(part, EXPM1))
     if not near:  # (I + G)^64 - I
         for _ in ti.static(range(6)):
-            grown = 2.0 * grown + commuting_product(grown, grown)
+            grown = 2.0 * grown + symmetric_product(grown, grown)
     return f + grown @ f
 
 
@@ -309,7 +335,7 @@ def newtonian(f, c):
     viscous stress would bound the substep by dx^2; this one is bounded by the speed of sound. Pressure is Tait's with
     exponent 7, tau = K/7 (J - J^-6) I (Becker & Teschner 2007; PAC-NeRF's fluid has viscosity mu / 2 and K = 7 kappa).
     """
-    kept = neural_flow(f, ti.Vector([c[2], 0.0 * c[2]]))
+    kept = neural_flow(f, isochoric_strain(f), ti.Vector([c[2], 0.0 * c[2]]))
     j = kept.determinant()
     b = power_of_third(j, -2) * (kept @ kept.transpose())
     j2 = j * j

@@ -41,7 +41,8 @@ def exact(law: Law) -> Law:
 
 
 def tabulated(law: L) -> L:
-    """A copy of ``law`` that has looked at its networks once, where it is one that interpolates their values.
+    """A copy of ``law`` that has looked at its networks once, where it is one that interpolates their values, and
+    remembers its coefficients, where it is a classical one.
 
     Its parameters must not be changed.
     """
@@ -49,8 +50,9 @@ def tabulated(law: L) -> L:
     for name in ("moduli_table", "rate_table"):
         if hasattr(law, name):
             setattr(law, name, functools.partial(_known, getattr(law, name)()))
-    if hasattr(law, "flow_table"):
-        setattr(law, "flow_table", functools.lru_cache(maxsize=8)(law.flow_table))  # noqa: B010  (a module's __setattr__)
+    for name in ("flow_table", "coefficients"):
+        if hasattr(law, name):
+            setattr(law, name, functools.lru_cache(maxsize=8)(getattr(law, name)))
     return law
 
 

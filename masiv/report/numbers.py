@@ -58,8 +58,7 @@ def _split(run: RunFolder, scene: Scene) -> tuple[tuple[str, list[int]], ...]:
 def run_numbers(
     run: RunFolder, scene: Scene, dynamic: DynamicGaussians, trajectory: Trajectory, rollout: np.ndarray
 ) -> dict[str, Any]:
-    """metrics.json of ``masiv identify``: no ground truth is needed."""
-    material = read_material(run.path)
+    """metrics.json of ``masiv identify`` but for ``material_numbers``: no ground truth is needed."""
     return {
         "schema": 1,
         "units": measure.UNITS,
@@ -72,8 +71,13 @@ def run_numbers(
             "volume_m3": float(trajectory.volume),
         },
         "seconds": run.seconds(),
-        **({} if material is None else {"material": {"summary": material["summary"]}}),
     }
+
+
+def material_numbers(run: RunFolder) -> dict[str, Any]:
+    """What metrics.json says of the material, which is described beside the rest."""
+    material = read_material(run.path)
+    return {} if material is None else {"material": {"summary": material["summary"]}}
 
 
 def evaluation_numbers(
