@@ -27,7 +27,7 @@ MODULI = (3e3, 1e4, 3e4, 1e5, 3e5)
 throw."""
 FLUID = "honey"
 """A viscous fluid, which needs no teaching: constants. (The pretrained water has no viscosity.)"""
-SEARCHED = {"jelly": (0.5, 0, 0, 0), FLUID: (0.5, 0, 0, 0.7)}
+SEARCHED = {"jelly": (0.5, 0, 0, 0), FLUID: (0.5, 0, 0, 0.7), "sand": (0.5, 0.7, 0, 0)}
 FLOWS = 0.5, 0, 0.7, 0
 """First steps of a simplex search in the logarithms of ``NeuralLaw.scales``, 0 where one is left to the fit: few
 particles on a coarse grid are another model, and a search over all four makes up for it with the material."""

@@ -75,15 +75,17 @@ class NeuralLaw(Law):
     ) -> NeuralLaw:
         """A Maxwell fluid: moduli [Pa] and relaxation time [s] are the same at all strains. In motions that are slow
         beside the relaxation time it is Newtonian, of viscosity shear modulus x relaxation time [Pa s]."""
-        law = cls(stress_scale=shear_modulus, width=width, seed=seed)
-        least = -2 * LOG_MODULUS_RANGE  # as little as the networks can say
-        bulk = LOG_MODULUS_RANGE * math.atanh(math.log(bulk_modulus / shear_modulus) / LOG_MODULUS_RANGE)
+        law = cls.of_moduli(shear_modulus=shear_modulus, bulk_modulus=bulk_modulus, width=width, seed=seed)
         rate = LOG_RATE_RANGE * math.atanh(-math.log(relaxation_time) / LOG_RATE_RANGE)
-        constants = (law.elastic, (0.0, least, bulk, 0.0)), (law.plastic, (rate, -2 * LOG_RATE_RANGE))
-        with torch.no_grad():
-            for network, values in constants:
-                network[-1].weight.zero_()
-                network[-1].bias.copy_(torch.tensor(values))
+        _constant(law.plastic, (rate, -2 * LOG_RATE_RANGE))
+        return law
+
+    @classmethod
+    def of_moduli(cls, *, shear_modulus: float, bulk_modulus: float, width: int = 24, seed: int = 0) -> NeuralLaw:
+        """A law whose moduli [Pa] are the same at all strains; how it flows is as the seed has it."""
+        law = cls(stress_scale=shear_modulus, width=width, seed=seed)
+        bulk = LOG_MODULUS_RANGE * math.atanh(math.log(bulk_modulus / shear_modulus) / LOG_MODULUS_RANGE)
+        _constant(law.elastic, (0.0, -2 * LOG_MODULUS_RANGE, bulk, 0.0))  # g2: as little as the networks can say
         return law
 
     def scales(self) -> list[torch.nn.Parameter]:
@@ -194,6 +196,13 @@ def _network(width: int, outputs: int, generator: torch.Generator) -> torch.nn.S
         torch.nn.init.xavier_uniform_(layer.weight, generator=generator)
         torch.nn.init.zeros_(layer.bias)
     return torch.nn.Sequential(layers[0], torch.nn.GELU(), layers[1], torch.nn.GELU(), layers[2])
+
+
+def _constant(network: torch.nn.Sequential, values: tuple[float, ...]) -> None:
+    """Let ``network`` give ``values``, whatever it is given."""
+    with torch.no_grad():
+        network[-1].weight.zero_()
+        network[-1].bias.copy_(torch.tensor(values))
 
 
 def _trace(a: torch.Tensor) -> torch.Tensor:

@@ -2,7 +2,7 @@
 
 Two phases. The pointwise states of the throw (trial gradient, elastic gradient, stress) are fitted first; then the law
 is rolled out from true states, in segments that grow, and the positions are compared (teacher forcing, Ma et al. 2023,
-section 4).
+section 4). Sand is taught otherwise: see ``cohesionless``.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from masiv.errors import InputError
+from masiv.materials import cohesionless
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.neural import NeuralLaw, strain_invariants
 from masiv.mpm.rollout import at_rest, rollout
@@ -29,6 +30,7 @@ MATERIALS = {
     "sand": ("drucker_prager", {"youngs_modulus": 1e6, "poissons_ratio": 0.2, "friction_angle": 25.0}),
     "water": ("water", {"youngs_modulus": 1e5, "poissons_ratio": 0.3}),
 }
+CONE = "drucker_prager"
 SIDE, PER_SIDE, STEPS, DT = 0.5, 10, 1000, 5e-4
 VELOCITY, OMEGA = (1.0, -1.5, -2.0), (4.0, 4.0, 4.0)
 
@@ -91,6 +93,9 @@ def pretrain(
         raise InputError(f"unknown material '{material}': use one of {', '.join(MATERIALS)}")
     kind, parameters = MATERIALS[material]
     truth = throw(material)
+    if kind == CONE:
+        law = cohesionless.teach(ClassicalLaw(kind, **parameters), DT, pointwise // 2, seed, progress)
+        return law, _quality(law, truth)
     law = NeuralLaw(stress_scale=ClassicalLaw(kind, **parameters).wave_modulus() / 2, seed=seed)
     strain = strain_invariants(torch.cat([state.trial_gradient for state in truth.states[::10]]))
     with torch.no_grad():

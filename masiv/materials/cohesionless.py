@@ -1,0 +1,108 @@
+"""A neural law that is taught what sand does, on strains from everywhere.
+
+One throw shows little of a cone: whether matter flows depends on the ratio of two strains, over decades of both. A law
+taught on the states of a throw alone (as the others are) held no slope at all. So strains are sampled over the lattice
+of the law, more of them near the cone, and the networks learn where the classical law flows and where it does not: at
+least a rate within which a substep loses everything there, at most a rate that no film shows here. What lies between is
+bounded by ``table.gentle``: the steepest law is perfect plasticity, which is what a cone is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from masiv.materials.classical import ClassicalLaw
+from masiv.materials.neural import LOG_RATE_RANGE, NeuralLaw, strain_invariants
+from masiv.progress import Progress
+
+FLOW_STRAIN = 5e-4
+"""Strains below which the cone is blunt: a thousandth of what is left of sand that holds a slope of its own."""
+SAMPLES, BATCH = 60_000, 4096
+LARGEST = 1.2
+FLOWING, RESTING = 9.5, -3.0
+"""Logarithms of the rates [1/s] to reach and not to reach: a tenth of a millisecond, and twenty seconds."""
+LEFT = 0.25
+"""What flows, as -ln of the share that is kept: the lattice begins one node early."""
+
+
+def teach(truth: ClassicalLaw, dt: float, iterations: int, seed: int, progress: Progress) -> NeuralLaw:
+    """A neural law that flows where ``truth``, a law with a cone, does within a substep of dt [s]; with its moduli at
+    small strains at all strains."""
+    shear, bulk = _moduli(truth)
+    law = NeuralLaw.of_moduli(shear_modulus=shear, bulk_modulus=bulk, seed=seed)
+    with torch.no_grad():
+        law.log_flow_strain.fill_(math.log(FLOW_STRAIN))
+    generator = torch.Generator().manual_seed(seed)
+    trial = _strains(truth, dt, generator)
+    flowed = _flowed(truth, trial, dt)
+    features = law.features(strain_invariants(trial), FLOW_STRAIN)
+    flows, unclear = flowed > LEFT, (flowed > 0) & (flowed <= LEFT)
+    parameters = list(law.plastic.parameters())
+    optimiser = torch.optim.Adam(parameters, lr=5e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=1e-5)
+    for i in range(iterations):
+        pick = torch.randint(len(features), (BATCH,), generator=generator)
+        rate = LOG_RATE_RANGE * torch.tanh(law.plastic(features[pick]) / LOG_RATE_RANGE)
+        short = torch.where(flows[pick], torch.relu(FLOWING - rate), torch.relu(rate - RESTING))
+        loss = short.masked_fill(unclear[pick], 0).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        if i % 100 == 99:
+            progress("strains", i + 1, iterations, f"loss {float(loss.detach()):.3g}")
+    return law
+
+
+@torch.no_grad()
+def _moduli(truth: ClassicalLaw) -> tuple[float, float]:
+    """Shear and bulk modulus [Pa] at small strains."""
+    small = 1e-4
+    stretches = torch.tensor([[small, -small, 0.0], [small, small, small]], dtype=torch.float64).exp()
+    shear, volume = truth.stress(torch.diag_embed(stretches).to(torch.float32)).double()
+    return float(shear[0, 0] - shear[1, 1]) / (4 * small), float(volume.trace()) / (9 * small)
+
+
+@torch.no_grad()
+def _strains(truth: ClassicalLaw, dt: float, generator: torch.Generator) -> torch.Tensor:
+    """Deformation gradients (SAMPLES, 3, 3): volume and shear uniform over the law's features; for more than half, a
+    compression and a shear within a factor of two or so of what ``truth`` keeps there."""
+
+    def uniform() -> torch.Tensor:
+        return torch.rand(SAMPLES, generator=generator)
+
+    volume = (FLOW_STRAIN * torch.sinh(12 * uniform() - 6)).clamp(-LARGEST, LARGEST)
+    shear = 0.5 * FLOW_STRAIN * torch.sqrt(torch.expm1(16 * uniform()))
+    near = uniform() < 0.6
+    volume = torch.where(near, -volume.abs(), volume)
+    angle = 2 * math.pi * uniform()
+    thirds = torch.tensor([0.0, 2.0, -2.0]) * math.pi / 3
+    way = math.sqrt(2 / 3) * torch.cos(angle[:, None] + thirds)
+    far = torch.diag_embed(torch.exp(way + volume[:, None] / 3))
+    kept = _logs(truth.project(far, dt))[1]
+    spread = torch.exp(0.6 * torch.randn(SAMPLES, generator=generator))
+    shear = torch.where(near, kept * spread, shear).clamp(max=LARGEST)
+    return torch.diag_embed(torch.exp(shear[:, None] * way + volume[:, None] / 3))
+
+
+@torch.no_grad()
+def _flowed(truth: ClassicalLaw, trial: torch.Tensor, dt: float) -> torch.Tensor:
+    """-ln (K, 2) of the shares of shear and volume that ``truth`` keeps."""
+    before, after = _logs(trial), _logs(truth.project(trial, dt))
+    least = 1e-12
+    return torch.stack(
+        [
+            torch.log(b.abs().clamp_min(least) / a.abs().clamp_min(least))
+            for b, a in zip(before[::-1], after[::-1], strict=True)
+        ],
+        dim=1,
+    )
+
+
+def _logs(stretched: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """ln J and the size of the isochoric Hencky strain, (K,) each, of diagonal gradients (K, 3, 3)."""
+    log = torch.log(stretched.diagonal(dim1=1, dim2=2))
+    volume = log.sum(1)
+    return volume, (log - volume[:, None] / 3).norm(dim=1)
