@@ -97,6 +97,7 @@ def refined(case, config, with_oracle):
     from masiv.refine.model import Simulation
     from masiv.refine.observed import SampledMotion
     from masiv.refine.prepare import experiment_of
+    from masiv.refine.rounds import like_accepted
     from masiv.refine.stage import Refined
     from masiv.refine.summary import verdict
 
@@ -131,6 +132,7 @@ def refined(case, config, with_oracle):
             for r in outcome.rounds for t in r.trials
         ],
         "accepted": list(outcome.after.model.effects),
+        "or_else": {name: like_accepted(name, outcome.rounds)["or_else"] for name in outcome.after.model.effects},
         "law": outcome.after.model.family.kind,
         "values": outcome.after.values,
         "stderr": outcome.after.stderr,
@@ -146,22 +148,34 @@ def quiet(*_):
     """No progress."""
 
 
+ANSWERS = "named", "named, with others beside it", "one of others beside it", "abstained", "wrong"
+
+
 def table(path):
     rows = [json.loads(line) for line in Path(path).read_text().splitlines()]
-    right = second = 0
-    print("| case | accepted | first ranked | before fit / held out [mm] | after | oracle | s |")
-    print("|---|---|---|---|---|---|---|")
+    counts = dict.fromkeys(ANSWERS, 0)
+    print("| case | accepted | may as well be | first ranked | before fit / held out [mm] | after | oracle | s |")
+    print("|---|---|---|---|---|---|---|---|")
     for r in rows:
-        true = set(r["true"])
-        right += set(r["accepted"]) == true
-        tried = [t[1] for t in r["trials"]]
-        second += set(r["accepted"]) == true or bool(true & set(tried[:2]))
+        counts[judged(r)] += 1
+        others = ", ".join(other for names in r["or_else"].values() for other in names)
         show = [" / ".join(f"{v:.1f}" for v in r[k]) if isinstance(r[k], list) else "–"
                 for k in ("before", "after", "oracle")]  # fmt: skip
         ranked = f"{r['ranked'][0][0]} {r['ranked'][0][1]}" if r["ranked"] else "–"
-        print(f"| {r['case']} | {', '.join(r['accepted']) or 'none'} | {ranked} | {show[0]} | {show[1]} | {show[2]} | "
-              f"{sum(r['seconds']):.0f} |")  # fmt: skip
-    print(f"\nexactly right: {right} of {len(rows)}; right, or among the two best refits: {second} of {len(rows)}")
+        print(f"| {r['case']} | {', '.join(r['accepted']) or 'none'} | {others} | {ranked} | {show[0]} | {show[1]} | "
+              f"{show[2]} | {sum(r['seconds']):.0f} |")  # fmt: skip
+    print("\n" + ", ".join(f"{name}: {count}" for name, count in counts.items()) + f"; of {len(rows)}")
+
+
+def judged(row):
+    """What the answer is worth: a control that is left alone is named, too, and so is an effect of no library."""
+    true, found = set(row["true"]), set(row["accepted"])
+    others = {other for names in row["or_else"].values() for other in names}
+    if found == true or (not found and not true <= STRENGTHS.keys()):
+        return "named, with others beside it" if others else "named"
+    if not found:
+        return "abstained"
+    return "one of others beside it" if true <= found | others else "wrong"
 
 
 def main():

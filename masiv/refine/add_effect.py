@@ -59,6 +59,8 @@ def refit(simulation: Simulated, base: Fitted, candidate: Candidate, soft: float
         jump, jumped = best_strength(simulation, model, start, term.strengths, soft)
         if jumped < cost:
             return full_fit(simulation, model, jump, budget=2 * len(params) + 6, soft=soft, held=held)
+        if not others:  # a narrow valley (a clock that is off, against the throw) needs its derivatives anew
+            return full_fit(simulation, model, values, budget=4 * (len(params) + 1), soft=soft, held=held)
     if not others:
         return summarised(simulation, model, params, values, jacobian, soft=soft)
     guessed = summarised(simulation, model, first, values, jacobian, soft=soft)
