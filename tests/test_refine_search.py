@@ -1,0 +1,102 @@
+"""What the search of causes tries again, and what it does not try."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from masiv.identify.parametric import Parameter
+from masiv.refine import add_effect, loop, second_look
+from masiv.refine.config import RefineConfig
+from masiv.refine.rounds import Round, Trial
+from masiv.refine.simulated import Term
+from masiv.workers import Workers
+
+NUMBERS = {"ground_height": 1, "linear_drag": 1, "restitution": 1, "point_mass": 4, "body_force": 3}
+KINKED = ("restitution",)
+LAW = SimpleNamespace(kind="neo_hookean")
+
+
+class Library:
+    """Knows terms and nothing else."""
+
+    experiments = ()
+
+    def term(self, name):
+        own = tuple(Parameter(f"{name}.{k}", 0.0, 0.0, 1.0, 0.1) for k in range(NUMBERS[name]))
+        return Term(name, name, own, (), ((),), {}, kinked=name in KINKED)
+
+    def candidates(self, model):
+        return [n for n in NUMBERS if n not in model.effects]
+
+
+def fit(*effects, cost=1.0):
+    numbers = [None] * (9 + sum(NUMBERS[n] for n in effects))
+    return SimpleNamespace(
+        model=SimpleNamespace(family=LAW, effects=effects), cost=cost, parameters=numbers,
+        samples=100, bic=lambda samples: cost,
+    )  # fmt: skip
+
+
+def trial(name, **changes):
+    return Trial(SimpleNamespace(effect=name), fit(name, **changes))
+
+
+@pytest.mark.parametrize(
+    ("rival", "beside_rival"),
+    [
+        ("point_mass", {"linear_drag", "restitution"}),
+        ("linear_drag", {"ground_height", "restitution"}),
+    ],
+)
+def test_a_rival_of_many_numbers_is_not_tried_beside_the_accepted_cause(rival, beside_rival, monkeypatch):
+    looked = {}
+
+    def ranked(workers, simulation, base, *, soft, names, progress):
+        looked[base.model.effects] = set(names)
+        return []
+
+    monkeypatch.setattr(second_look, "ranked", ranked)
+    monkeypatch.setattr(second_look, "carried", lambda simulation, fitted, soft: fitted)
+    current = fit("ground_height")
+    first = Round(current, [], [trial("ground_height"), trial(rival)], None, {})
+    second_look.second_look(Library(), current, first, 1.0, RefineConfig(), lambda *_: None, Workers())
+    assert looked == {("ground_height",): {"linear_drag", "restitution"} - {"ground_height"}, (rival,): beside_rival}
+
+
+def test_what_is_simpler_or_has_a_kink_is_fitted_again_from_where_the_best_ended(monkeypatch):
+    again = []
+
+    def side_by_side(workers, simulation, function, tasks):
+        for _, name, best, _ in tasks:
+            again.append(name)
+            assert best.model.effects == ("linear_drag",)
+            yield fit(name, cost=0.5)
+
+    monkeypatch.setattr(loop, "side_by_side", side_by_side)
+    trials = [trial("linear_drag"), trial("ground_height", cost=2.0), trial("restitution", cost=2.0),
+              trial("point_mass", cost=2.0)]  # fmt: skip
+    loop._second_chance(Library(), trials, 1.0, lambda *_: None, Workers())
+    assert again == ["restitution"]
+    assert [t.fitted.cost for t in trials] == [1.0, 2.0, 0.5, 2.0]
+
+
+def test_a_cause_that_falls_short_of_its_promise_gets_fresh_derivatives(monkeypatch):
+    base = SimpleNamespace(
+        model=SimpleNamespace(with_effect=lambda name: name), values={}, cost=1.0, parameters=(), effects=()
+    )  # fmt: skip
+    candidate = SimpleNamespace(finite=False, effect="linear_drag", explained=0.8, rivals=(),
+                                theta={"linear_drag.0": 0.3})  # fmt: skip
+    ended = {"linear_drag.0": 1e-3}
+    calls = []
+    monkeypatch.setattr(add_effect, "held_in", lambda *_: frozenset())
+    monkeypatch.setattr(add_effect, "_fitted_beside", lambda simulation, base, term: list(term.parameters))
+    monkeypatch.setattr(add_effect, "_as_guessed", lambda *_: (0.95, ended, None, None))
+    monkeypatch.setattr(add_effect, "best_strength", lambda *_: (None, 1.2))
+    monkeypatch.setattr(add_effect, "full_fit", lambda simulation, model, values, **_: calls.append(values) or "fresh")
+    monkeypatch.setattr(add_effect, "summarised", lambda *_, **__: "as it was")
+    assert add_effect.refit(Library(), base, candidate, 1.0) == "fresh"
+    assert calls == [ended]
+    candidate.explained = 0.05
+    assert add_effect.refit(Library(), base, candidate, 1.0) == "as it was"
