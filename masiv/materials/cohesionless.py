@@ -18,11 +18,12 @@ from masiv.materials.neural import LOG_RATE_RANGE, NeuralLaw, strain_invariants
 from masiv.progress import Progress
 
 FLOW_STRAIN = 5e-4
-"""Strains below which the cone is blunt: a thousandth of what is left of sand that holds a slope of its own."""
+"""Strain below which the cone is blunt: below the elastic strains of sand that carries itself, 1e-3 to 1e-2."""
 SAMPLES, BATCH = 60_000, 4096
 LARGEST = 1.2
+"""Logarithm of the largest volume ratio and stretch that are shown."""
 FLOWING, RESTING = 9.5, -3.0
-"""Logarithms of the rates [1/s] to reach and not to reach: a tenth of a millisecond, and twenty seconds."""
+"""Logarithms of the rates [1/s] to reach and not to exceed: relaxation in a tenth of a millisecond, and in 20 s."""
 LEFT = 0.25
 """What flows, as -ln of the share that is kept: the lattice begins one node early."""
 
