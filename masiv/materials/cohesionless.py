@@ -40,8 +40,7 @@ def teach(truth: ClassicalLaw, dt: float, iterations: int, seed: int, progress: 
     flowed = _flowed(truth, trial, dt)
     features = law.features(strain_invariants(trial), FLOW_STRAIN)
     flows, unclear = flowed > LEFT, (flowed > 0) & (flowed <= LEFT)
-    parameters = list(law.plastic.parameters())
-    optimiser = torch.optim.Adam(parameters, lr=5e-3)
+    optimiser = torch.optim.Adam(law.plastic.parameters(), lr=5e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=1e-5)
     for i in range(iterations):
         pick = torch.randint(len(features), (BATCH,), generator=generator)

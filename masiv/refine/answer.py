@@ -15,9 +15,10 @@ def answer(document: Mapping[str, Any]) -> str:
 def _named(entry: Mapping[str, Any]) -> str:
     others = entry.get("or_else")
     if not others:
-        return _words(entry["effect"])
-    return f"one of {', '.join(map(_words, [entry['effect'], *others]))} (this motion does not tell which)"
+        return words(entry["effect"])
+    return f"one of {', '.join(map(words, [entry['effect'], *others]))} (this motion does not tell which)"
 
 
-def _words(name: str) -> str:
+def words(name: str) -> str:
+    """A name of the code for people."""
     return name.replace("_", " ")

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from masiv.errors import InputError
-from masiv.refine.answer import answer
+from masiv.refine.answer import answer, words
 from masiv.report import plots
 from masiv.report.page import Page, Share, number
 
@@ -65,9 +65,9 @@ def refine_section(run: Path, up: np.ndarray | None = None) -> str | None:
 
 def _verdict(document: Mapping[str, Any]) -> str:
     laws = document["laws"]
-    law = _words(laws["before"])
+    law = words(laws["before"])
     if laws["after"] != laws["before"]:
-        law += f", then {_words(laws['after'])}"
+        law += f", then {words(laws['after'])}"
     errors = [
         f"{label} {_mm(document['before'], split)} → {_mm(document['after'], split)} mm"
         for split, label in (("fit", "fitted frames"), ("held_out", "held-out frames"))
@@ -114,12 +114,12 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
         ["effect", "explains alone", "strength", "unit", "standard error", "looks like", "what it does in a video"],
         [
             [
-                _words(c["effect"]),
+                words(c["effect"]),
                 Share(c["explained"]),
                 _number(c["theta"]),
                 _unit(c["unit"]),
                 _number(c["stderr"]),
-                ", ".join(map(_words, c["confusable_with"])) or None,
+                ", ".join(map(words, c["confusable_with"])) or None,
                 c["looks_like"],
             ]
             for c in candidates
@@ -136,10 +136,10 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
     rows = []
     for turn, done in enumerate(rounds, start=1):
         for refit in done["refits"]:
-            values = ", ".join(f"{_words(n)} {number(_number(q['value']))}" for n, q in refit["parameters"].items())
+            values = ", ".join(f"{words(n)} {number(_number(q['value']))}" for n, q in refit["parameters"].items())
             outcome = "accepted" if refit["accepted"] else "; ".join(refit["objections"]) or "another was better"
             rows.append([
-                turn, ", ".join(map(_words, [*done["base"]["effects"], refit["effect"]])), _words(refit["law"]),
+                turn, ", ".join(map(words, [*done["base"]["effects"], refit["effect"]])), words(refit["law"]),
                 _number(refit["fit_rmse_mm"]), _number(refit["held_out_rmse_mm"]),
                 _number(refit["information_gain"]), values, outcome,
             ])  # fmt: skip
@@ -161,7 +161,7 @@ def _before_after(page: Page, before: Mapping[str, Any], after: Mapping[str, Any
     for key in keys:
         cells = [_number(errors[split].get(key)) for split in splits for errors in (before, after)]
         if any(cell is not None for cell in cells):
-            rows.append([*METRICS.get(key, (_words(key), "")), *cells])
+            rows.append([*METRICS.get(key, (words(key), "")), *cells])
     labels = {"fit": "fitted", "held_out": "held out"}
     page.table(["quantity", "unit", *(f"{labels[s]}, {when}" for s in splits for when in ("before", "after"))], rows)
     frames = [f"{labels[s]}: {_span(before[s]['frames'])}" for s in splits if before[s].get("frames")]
@@ -181,13 +181,13 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
         ["effect", "parameter", "value", "standard error", "unit", "may as well be", "looks like"],
         [
             [
-                _words(a["effect"]),
-                _words(n),
+                words(a["effect"]),
+                words(n),
                 _number(value),
                 _number(a["stderr"].get(n)),
                 _unit(a["unit"].get(n, "")),
-                ", ".join(map(_words, a.get("or_else", []))) or None,
-                ", ".join(map(_words, a.get("confusable_with", []))),
+                ", ".join(map(words, a.get("or_else", []))) or None,
+                ", ".join(map(words, a.get("confusable_with", []))),
             ]
             for a in accepted
             for n, value in a["theta"].items()
@@ -225,7 +225,7 @@ def _next_throw(page: Page, proposal: Mapping[str, Any] | None) -> None:
     page.subheading("The throw to film next")
     velocity, spin = proposal["velocity"], proposal["omega"]
     page.note(
-        f"{' and '.join(map(_words, proposal['tells_apart']))} look alike in this throw "
+        f"{' and '.join(map(words, proposal['tells_apart']))} look alike in this throw "
         f"({number(_number(proposal['difference_in_this_throw_mm']))} mm apart). Thrown at {number(velocity['value'])} "
         f"{velocity['unit']} with a spin of {number(spin['value'])} {spin['unit']}, they would be "
         f"{number(_number(proposal['predicted_difference_mm']))} mm apart."
@@ -238,7 +238,3 @@ def _number(value: Any) -> float | None:
 
 def _unit(unit: str) -> str:
     return "" if unit == "1" else unit
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
