@@ -62,17 +62,25 @@ def polished(problem, fitted):
     )
 
 
+def picture_sum(problem, report, name):
+    """What fits are compared by, from the errors that are reported."""
+    paint = problem.config.polish_paint_weight * report.get(f"paint_error_of_{name}", 0.0)
+    return problem.config.polish_silhouette_weight * report[f"silhouette_error_of_{name}"] + paint
+
+
 def test_surfaces_correct_what_paths_had_wrong_and_silhouettes_refuse_what_they_make_worse(filmed, seen, monkeypatch):  # noqa: F811
     problem = problem_of(filmed, seen, velocity_learning_rate=0.06)
     wrong = thrown(problem, 0.4)
-    better, report = polished(problem, wrong)
-    assert report["silhouette_error_of_surfaces"] < 0.8 * report["silhouette_error_of_paths"]
+    better, nearness, first = polished(problem, wrong)
+    assert first["silhouette_error_of_surfaces"] < 0.8 * first["silhouette_error_of_paths"]
     assert abs(float(better.motion.velocity[0]) - VELOCITY[0]) < 0.2
     assert problem.config.geometry_loss == "trajectory"  # the problem of the paths is as it was
     monkeypatch.setattr(polish, "fit", lambda *_, **__: thrown(problem, 0.4))
     right = thrown(problem, 0.0)
-    kept, report = polished(problem, right)
+    kept, nearer, report = polished(problem, right)
     assert kept is right
+    assert nearer == pytest.approx(picture_sum(problem, report, "paths"))
+    assert nearness == pytest.approx(picture_sum(problem, first, "surfaces"))
     assert report["silhouette_error_of_surfaces"] > report["silhouette_error_of_paths"]
 
 

@@ -1,8 +1,10 @@
-"""A neural law: its starts, a fit from the nearest, beside it one from its rival, and the polish of the better."""
+"""A neural law: its starts, a fit from the nearest, beside it one from its rival, and the choice between the two."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from masiv.checkpoint import Checkpoint
@@ -13,11 +15,21 @@ from masiv.identify.problem import Motion, Problem
 from masiv.identify.start import Start, best_first, choose_start
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress, silent
-from masiv.workers import Failed, Workers, processes_wanted
+from masiv.workers import Failed, Workers, attempt, demanded, processes_wanted
 
 RIVAL = 1.3
 """The second start is fitted, too, where its error is at most this factor of the first's. Starts are simulated with few
 particles: what is nearer there may lead to the worse fit (sand began as a viscous fluid)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """A start and the fit from it; error: what it is compared with others by."""
+
+    start: Start
+    fitted: Fit
+    error: float
+    report: dict[str, float]
 
 
 def learn(
@@ -37,35 +49,22 @@ def learn(
             starts = [_start_from(state) for state in saved["starts"]]
         else:
             workers.begin()
-            saved, starts = {}, _worth_fitting(choose_start(few(), motion, progress, workers))
-        fixed: dict[str, Any] = {"starts": [_start_state(start) for start in starts]}
-        keeper = _With(checkpoint, fixed)
-        if "fitted" in saved:
-            start = starts[saved["chosen"]]
-            fitted = fit_from(saved["fitted"], NeuralLaw(width=start.law.width))
-        else:
-            keeper.save(saved)
-            heard = silent if workers.processes > 1 else (lambda _, *said: progress("identify: fit a rival", *said))
-            rest = [workers.beside(_fitted, (problem, s, motion, first_frames, seed, heard)) for s in starts[1:]]
-            reached = [(starts[0], _fit(problem, starts[0], motion, first_frames, seed, keeper, progress))]
-            for rival, waited in zip(starts[1:], rest, strict=True):
-                state = waited()
-                if not isinstance(state, Failed):  # it diverges, perhaps
-                    reached.append((rival, fit_from(state, NeuralLaw(width=rival.law.width))))
-            start, fitted = _better(reached)
-    report: dict[str, Any] = {
-        "start": start.material, "start_objective": start.error, "geometry_loss": problem.config.geometry_loss
-    }  # fmt: skip
-    if wanted(problem):
-        chosen = {"chosen": starts.index(start), "fitted": fit_state(fitted)}
-        keeper = _With(checkpoint, fixed | chosen)
-        if "fitted" not in saved:
+            starts = _worth_fitting(choose_start(few(), motion, progress, workers))
+        keeper = _With(checkpoint, {"starts": [_start_state(start) for start in starts]})
+        if "starts" not in saved:
             keeper.save({})
-        fitted, seen = polish(
-            problem, fitted, start.contact, start.law, seed=seed, checkpoint=keeper, progress=progress
-        )  # fmt: skip
-        report |= seen
-    return Found(fitted.law, fitted.motion, start.contact, fitted.error_m, report, history_rows(fitted))
+        heard = silent if workers.processes > 1 else (lambda what, *said: progress(f"{what}, a rival", *said))
+        rest = [workers.beside(_reach_apart, (problem, s, motion, first_frames, seed, heard)) for s in starts[1:]]
+        first = attempt(_reach, (problem, starts[0], motion, first_frames, seed, keeper, progress))
+        ends = [(starts[0], first), *((start, waited()) for start, waited in zip(starts[1:], rest, strict=True))]
+    reached = [_reached_from(start, end) for start, end in ends if not isinstance(end, Failed)]  # it diverges, perhaps
+    kept = _best(reached) if reached else demanded(first)
+    report: dict[str, Any] = {
+        "start": kept.start.material, "start_objective": kept.start.error,
+        "geometry_loss": problem.config.geometry_loss, **kept.report,
+    }  # fmt: skip
+    fitted = kept.fitted
+    return Found(fitted.law, fitted.motion, kept.start.contact, fitted.error_m, report, history_rows(fitted))
 
 
 def _worth_fitting(starts: list[Start]) -> list[Start]:
@@ -73,32 +72,58 @@ def _worth_fitting(starts: list[Start]) -> list[Start]:
     return [first, *(s for s in rest[:1] if s.error <= RIVAL * first.error)]
 
 
-def _better(reached: list[tuple[Start, Fit]]) -> tuple[Start, Fit]:
-    """By the objective, with the same advantage to the elastic one as among starts."""
-    ends = [Start(start.material, start.contact, start.law, fitted.objective) for start, fitted in reached]
+def _best(reached: list[Reached]) -> Reached:
+    """The nearest, with the same advantage to the elastic one as among starts."""
+    ends = [Start(r.start.material, r.start.contact, r.start.law, r.error) for r in reached]
     return reached[ends.index(best_first(ends)[0])]
 
 
-def _fit(
+def _reach(
     problem: Problem, start: Start, motion: Motion, first: int, seed: int, checkpoint: Checkpoint, progress: Progress
-) -> Fit:
-    return fit(problem, start.law, motion, start.contact, first, seed=seed, checkpoint=checkpoint, progress=progress)
+) -> dict[str, Any]:
+    """The state of a fit from ``start`` after everything that is done to one.
+
+    Fits are compared by the pictures where those have the last word: after paths alone the worse one may be nearer to
+    them (a letter that flows is a plasticine then, and honey in the end)."""
+    saved = checkpoint.load() or {}
+    if "fitted" in saved:
+        fitted = fit_from(saved["fitted"], NeuralLaw(width=start.law.width))
+    else:
+        fitted = fit(
+            problem, start.law, motion, start.contact, first, seed=seed, checkpoint=checkpoint, progress=progress
+        )  # fmt: skip
+    error, seen = fitted.objective, {}
+    if wanted(problem):
+        keeper = _With(checkpoint, {"fitted": fit_state(fitted)})
+        if "fitted" not in saved:
+            keeper.save({})
+        fitted, error, seen = polish(
+            problem, fitted, start.contact, start.law, seed=seed, checkpoint=keeper, progress=progress
+        )  # fmt: skip
+    return {"fitted": fit_state(fitted), "error": error, "report": seen}
 
 
-def _fitted(problem: Problem, start: Start, motion: Motion, first: int, seed: int, progress: Progress) -> dict:
-    """The state of a fit, as a task of another process."""
-    return fit_state(_fit(problem, start, motion, first, seed, Checkpoint(None), progress))
+def _reach_apart(problem: Problem, start: Start, motion: Motion, first: int, seed: int, progress: Progress) -> dict:
+    """``_reach`` as a task of another process."""
+    return _reach(problem, start, motion, first, seed, Checkpoint(None), progress)
+
+
+def _reached_from(start: Start, state: dict[str, Any]) -> Reached:
+    fitted = fit_from(state["fitted"], NeuralLaw(width=start.law.width))
+    return Reached(start, fitted, state["error"], state["report"])
 
 
 class _With(Checkpoint):
-    """A checkpoint whose every state also holds ``fixed``."""
+    """``checkpoint``, whose every state also holds ``fixed``."""
 
     def __init__(self, checkpoint: Checkpoint, fixed: dict) -> None:
         super().__init__(checkpoint.path, checkpoint.every_s)
-        self.fixed = fixed
+        self._within = checkpoint
+        self._fixed = fixed
 
     def save(self, state: dict) -> None:
-        super().save({**state, **self.fixed})
+        self._within.save({**state, **self._fixed})
+        self._last = time.monotonic()
 
 
 def _start_state(start: Start) -> dict:

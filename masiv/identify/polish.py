@@ -34,9 +34,9 @@ def polish(
     seed: int,
     checkpoint: Checkpoint,
     progress: Progress,
-) -> tuple[Fit, dict[str, float]]:
+) -> tuple[Fit, float, dict[str, float]]:
     """``fitted``, a neural law, after half as many iterations with surfaces in place of paths, or as it is where it
-    was nearer to the pictures; and how near both are."""
+    was nearer to the pictures; ``picture_objective`` of what is kept; and how near both are."""
     surfaces = problem.of_surfaces(problem.config.iterations // 2)
     other = fit(
         surfaces, fitted.law, fitted.motion, contact, surfaces.frames,
@@ -49,7 +49,7 @@ def polish(
     if problem.paint is not None:
         report |= {f"paint_error_of_{name}": float(errors[1]) for name, errors in seen.items()}
     before, after = (float(picture_objective(surfaces, errors)) for errors in seen.values())
-    return (other if after < before else fitted), report
+    return (other, after, report) if after < before else (fitted, before, report)
 
 
 @torch.no_grad()
