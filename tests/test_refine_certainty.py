@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from masiv.identify.parametric import Parameter
-from masiv.identify.smoothness import smoothness
 from masiv.refine.certainty import certainty, told_apart
+from masiv.refine.smoothness import smoothness
 
 INSTANTS, POINTS = 11, 120
 LENGTH, METRES, SIZE = 2.0, 0.12, 2e-3

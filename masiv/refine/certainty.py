@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from masiv.identify.smoothness import Smoothness, covariance_of, smoothness
 from masiv.refine.refit import Fitted
 from masiv.refine.simulated import Term, Watched
+from masiv.refine.smoothness import Smoothness, covariance_of, smoothness
 
 CERTAIN = 1.5
 """Times the noise that sigma is where the motion is as well simulated as it is observed."""

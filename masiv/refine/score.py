@@ -15,9 +15,9 @@ import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.identify.parametric import robust_weight
-from masiv.identify.smoothness import basis_of
 from masiv.refine.refit import Fitted, free_parameters, robust_cost
 from masiv.refine.simulated import Simulated, Term
+from masiv.refine.smoothness import basis_of
 
 AS_MUCH = 0.02
 """Difference of explained shares that is none."""
