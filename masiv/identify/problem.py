@@ -16,7 +16,6 @@ from masiv.effects.catalogue import effect_named
 from masiv.effects.effect import Setting
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.geometry import chamfer_error, surface_points, trajectory_error
-from masiv.identify.spread import well_spread
 from masiv.materials.law import Law
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
@@ -61,9 +60,9 @@ class Motion:
 class Problem:
     """Rollouts of one body against its observed trajectories.
 
-    ``particles`` of the trajectory, well spread, are used (all where None); targets (F * samples, N, 3) [m] are their
-    positions in the simulation frame at ``samples_per_frame`` instants a frame, the start left out. chosen (N,): which
-    particles of the trajectory they are. known: effects that act in every rollout which is given none.
+    ``particles`` of the trajectory are used (all where None); targets (F * samples, N, 3) [m] are their positions in
+    the simulation frame at ``samples_per_frame`` instants a frame, the start left out. chosen (N,): which particles of
+    the trajectory they are. known: effects that act in every rollout which is given none.
     """
 
     def __init__(
@@ -74,6 +73,7 @@ class Problem:
         simulator: SimulatorConfig,
         *,
         particles: int | None = None,
+        seed: int = 0,
         known: tuple[TwinEffect, ...] = (),
     ) -> None:
         self.scene = scene
@@ -87,7 +87,8 @@ class Problem:
         self.chosen = np.arange(points.shape[1])
         on_surface = surface_points(points[0]) if config.geometry_loss == "surface" else None
         if particles is not None and particles < points.shape[1]:
-            self.chosen = well_spread(points[0], particles)
+            chosen = np.random.default_rng(seed).choice(points.shape[1], particles, replace=False)
+            self.chosen = np.sort(chosen)
             points = points[:, self.chosen]
         moved = torch.as_tensor(self.axes.points_to_simulation(points), dtype=torch.float32)
         self.start, self.targets = moved[0].contiguous(), moved[1:]

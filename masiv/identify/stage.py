@@ -59,7 +59,7 @@ def _identify(
     axes = problem.axes
     motion = Motion.of_world(axes, launch.velocity, launch.omega)
     first_frames = min(launch.last_frame + 2, problem.frames)
-    few = functools.partial(Problem, scene, trajectory, config, simulator, particles=config.search_particles)
+    few = functools.partial(Problem, scene, trajectory, config, simulator, particles=config.search_particles, seed=seed)
     if config.law == "neural":
         found = learn(problem, few, motion, first_frames, seed, checkpoint, progress)
     else:
@@ -105,7 +105,7 @@ def relearn(
     Raises MasivError where no law explains ``trajectory``.
     """
     made = functools.partial(Problem, scene, trajectory, config, twin.simulator, known=twin.effects)
-    problem, few = made(), functools.partial(made, particles=config.search_particles)
+    problem, few = made(), functools.partial(made, particles=config.search_particles, seed=seed)
     axes = problem.axes
     raised = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
     motion = Motion.of_world(axes, twin.velocity, twin.omega, raised)

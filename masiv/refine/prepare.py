@@ -31,6 +31,8 @@ def experiment_of(
     identify: IdentifyConfig,
     simulator: SimulatorConfig,
     config: RefineConfig,
+    *,
+    seed: int,
 ) -> tuple[Experiment, Problem, Problem, Launch]:
     """The experiment, the problem of its fitted frames alone (on the same particles), that on few particles, and the
     launch.
@@ -40,10 +42,10 @@ def experiment_of(
     settings = identify.model_copy(update={"samples_per_frame": config.samples_per_frame})
     count = fitted.positions.shape[1]
     on_few, on_fewer = (thinned(simulator, min(n / count, 1.0)) for n in (config.particles, config.search_particles))
-    few = Problem(scene, fitted, settings, on_few, particles=config.particles)
-    fewer = Problem(scene, fitted, settings, on_fewer, particles=config.search_particles)
+    few = Problem(scene, fitted, settings, on_few, particles=config.particles, seed=seed)
+    fewer = Problem(scene, fitted, settings, on_fewer, particles=config.search_particles, seed=seed)
     fine = Problem(scene, whole, settings, thinned(simulator, FINER))
-    problem = Problem(scene, whole, settings, on_few, particles=config.particles)
+    problem = Problem(scene, whole, settings, on_few, particles=config.particles, seed=seed)
     problem.targets[: len(few.targets)] = few.targets
     problem.start = few.start
     launch = estimate_launch(fitted.positions, fitted.times, scene.gravity, scene.ground, clearance=few.spacing)
