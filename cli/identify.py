@@ -122,6 +122,7 @@ def _law_text(described: dict[str, Any], families: list[dict[str, Any]]) -> str:
         if "failed" in row:
             lines.append(f"         {row['law']}: failed, {row['failed']}")
         else:
-            criterion = f"BIC {row['bic_above_best']:.0f} above the best"
-            lines.append(f"         {row['law']}: {row['trajectory_error_mm']:.1f} mm, {criterion}")
+            seen = row["picture_error"]
+            nearness = f"BIC {row['bic_above_best']:.0f} above the best" if seen is None else f"pictures {seen:.3f}"
+            lines.append(f"         {row['law']}: {row['trajectory_error_mm']:.1f} mm from the paths, {nearness}")
     return "\n".join(lines) + "\n"

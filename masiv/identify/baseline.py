@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.classical_fit import FamilyFit, fit_all_particles, fit_family, information_criteria, ranked
+from masiv.identify.classical_fit import FamilyFit, fit_all_particles, fit_family, information_criteria
 from masiv.identify.families import FAMILIES
 from masiv.identify.fit import fit as fit_weights
 from masiv.identify.found import Found, history_rows
+from masiv.identify.judged import nearest_first, picture_errors_of
 from masiv.identify.problem import Motion, Problem
 from masiv.materials.adapter import AdapterLaw
 from masiv.progress import Progress
 
 SHORT = 1 / 3
 FINALISTS = 2
+BY_PICTURES = "nearest to the pictures, the simpler one where two are about as near"
 
 
 def identify_classical(
@@ -38,14 +40,16 @@ def identify_classical(
     )
     failures: dict[str, str] = {}
     if law == "auto":
-        fits, failures = _shortlisted(fit)
+        fits, failures = _shortlisted(fit, few)
     else:
         fits = [fit(law)]
-    chosen = fit_all_particles(ranked(fits)[0], few, problem, checkpoint, progress)
+    seen = picture_errors_of(few, fits) if law == "auto" else {}
+    order = nearest_first(fits, seen)
+    chosen = fit_all_particles(order[0], few, problem, checkpoint, progress)
     errors = {name: _known(chosen.stderr[name]) for name in chosen.values if name not in chosen.law.values}
     report: dict[str, Any] = {
         "law": chosen.kind,
-        "chosen_by": "least Bayesian information criterion" if law == "auto" else "asked for",
+        "chosen_by": "asked for" if law != "auto" else BY_PICTURES if seen else "least Bayesian information criterion",
         "velocity_stderr_m_per_s": [errors[f"velocity_{a}"] for a in "xyz"],
         "omega_stderr_rad_per_s": [errors[f"omega_{a}"] for a in "xyz"],
         "ground_stderr_m": errors.get("ground_offset"),
@@ -53,7 +57,10 @@ def identify_classical(
         "rollouts": chosen.rollouts + sum(f.rollouts for f in fits if f.kind != chosen.kind),
     }
     if law == "auto":
-        report["families"] = family_rows(fits) + [{"law": kind, "failed": why} for kind, why in failures.items()]
+        report["families"] = [
+            *family_rows(order, seen),
+            *({"law": kind, "failed": why} for kind, why in failures.items()),
+        ]
     if config.law != "adapter":
         return Found(chosen.law, chosen.motion, chosen.contact, chosen.error_m, report)
     start = AdapterLaw(chosen.law, rank=config.adapter_rank, seed=seed).float()
@@ -77,7 +84,7 @@ class Beside(Checkpoint):
         super().save({**self.fixed, **state})
 
 
-def _shortlisted(fit: Callable[..., FamilyFit]) -> tuple[list[FamilyFit], dict[str, str]]:
+def _shortlisted(fit: Callable[..., FamilyFit], few: Problem) -> tuple[list[FamilyFit], dict[str, str]]:
     """Short fits of every family, then the best ``FINALISTS`` in full; and why the others failed."""
     fits: dict[str, FamilyFit] = {}
     failures: dict[str, str] = {}
@@ -88,20 +95,22 @@ def _shortlisted(fit: Callable[..., FamilyFit]) -> tuple[list[FamilyFit], dict[s
             failures[kind] = str(failed)
     if not fits:
         raise MasivError(f"identify: no classical law explains the motion ({next(iter(failures.values()))})")
-    for kind in [f.kind for f in ranked(list(fits.values()))[:FINALISTS]]:
+    short = list(fits.values())
+    for kind in [f.kind for f in nearest_first(short, picture_errors_of(few, short))[:FINALISTS]]:
         fits[kind] = fit(kind, further=True)
     return list(fits.values()), failures
 
 
-def family_rows(fits: list[FamilyFit]) -> list[dict[str, Any]]:
-    """Errors and parameters of each family, best first, as fitted on few particles, those that lag in short."""
-    order = ranked(fits)
-    criteria = information_criteria(fits)
+def family_rows(order: list[FamilyFit], pictures: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Errors and parameters of each family, best first, as fitted on few particles, those that lag in short. pictures:
+    errors of those, empty where there are no pictures."""
+    criteria = information_criteria(order)
     return [
         {
             "law": f.kind,
             "trajectory_error_mm": 1e3 * f.error_m,
-            "bic_above_best": criteria[f.kind] - criteria[order[0].kind],
+            "picture_error": pictures.get(f.kind),
+            "bic_above_best": criteria[f.kind] - min(criteria.values()),
             "contact": f.contact,
             "parameters": f.law.description()["parameters"],
         }

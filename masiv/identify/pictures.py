@@ -10,13 +10,15 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from masiv.identify.problem import Problem
+from masiv.identify.problem import Motion, Problem
+from masiv.materials.law import Law
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 from masiv.splat.rasteriser import Rendering, render
 
 MARGIN = 6  # pixels around the mask's box
 OPACITY = 0.9
+VIEWS = 3
 SIZES = 0.1, 1.0
 """Standard deviations that a particle's blob may have, in particle spacings."""
 
@@ -97,6 +99,13 @@ def picture_errors(
         outlines.append(difference.abs().sum() / area)
         colours.append(torch.zeros(()) if paint is None else paint_error(paint, points, seen))
     return torch.stack(outlines).mean(), torch.stack(colours).mean()
+
+
+@torch.no_grad()
+def shown(problem: Problem, law: Law, motion: Motion, contact: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """``picture_errors`` of a rollout in ``VIEWS`` pictures of each frame, by which fits are compared."""
+    positions = problem.run(law, motion, contact, problem.frames)
+    return picture_errors(problem, positions, some_of_each(problem, problem.frames, VIEWS))
 
 
 def picture_objective(problem: Problem, errors: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:

@@ -7,17 +7,12 @@ drift.
 
 from __future__ import annotations
 
-import torch
-
 from masiv.checkpoint import Checkpoint
 from masiv.identify.fit import Fit, fit
-from masiv.identify.pictures import compared, picture_errors, picture_objective, some_of_each
+from masiv.identify.pictures import compared, picture_objective, shown
 from masiv.identify.problem import Problem
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
-
-VIEWS = 3
-"""Pictures of each frame by which the two fits are compared."""
 
 
 def wanted(problem: Problem) -> bool:
@@ -44,16 +39,9 @@ def polish(
         progress=lambda _, *rest: progress("identify: fit surfaces", *rest),
     )  # fmt: skip
     other.history = [*fitted.history, *((i + problem.config.iterations, *rest) for i, *rest in other.history)]
-    seen = {name: _seen(surfaces, f, contact) for name, f in (("paths", fitted), ("surfaces", other))}
+    seen = {name: shown(surfaces, f.law, f.motion, contact) for name, f in (("paths", fitted), ("surfaces", other))}
     report = {f"silhouette_error_of_{name}": float(errors[0]) for name, errors in seen.items()}
     if problem.paint is not None:
         report |= {f"paint_error_of_{name}": float(errors[1]) for name, errors in seen.items()}
     before, after = (float(picture_objective(surfaces, errors)) for errors in seen.values())
     return (other, after, report) if after < before else (fitted, before, report)
-
-
-@torch.no_grad()
-def _seen(problem: Problem, fitted: Fit, contact: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Errors of silhouettes and paint."""
-    positions = problem.run(fitted.law, fitted.motion, contact, problem.frames)
-    return picture_errors(problem, positions, some_of_each(problem, problem.frames, VIEWS))

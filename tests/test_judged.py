@@ -1,0 +1,50 @@
+"""Families are told apart by pictures, where there are some, whatever their paths say."""
+
+import dataclasses
+
+import pytest
+from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen  # noqa: F401  (fixtures)
+from test_polish import filmed, problem_of  # noqa: F401
+
+from masiv.identify.classical_fit import FamilyFit
+from masiv.identify.families import motion_parameters
+from masiv.identify.judged import nearest_first, picture_errors_of
+from masiv.identify.problem import Motion
+
+TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
+WRONG = {"viscosity": 40.0, "bulk_modulus": 1e5}
+
+
+def fitted(problem, kind, values, mean_square):
+    throw = motion_parameters(problem, Motion.of_world(problem.axes, VELOCITY, OMEGA))
+    every = {**values, **{p.name: p.start for p in throw}}
+    return FamilyFit(kind, "sticky", every, mean_square=mean_square, samples=100)
+
+
+def test_pictures_decide_against_paths(filmed, seen):  # noqa: F811
+    problem = problem_of(filmed, seen)
+    fits = [fitted(problem, "newtonian", WRONG, 1e-6), fitted(problem, "neo_hookean", TRUE, 1e-2)]
+    errors = picture_errors_of(problem, fits)
+    assert errors["neo_hookean"] < 0.5 * errors["newtonian"]
+    assert [f.kind for f in nearest_first(fits, errors)] == ["neo_hookean", "newtonian"]
+
+
+def test_without_pictures_paths_decide(filmed, seen):  # noqa: F811
+    problem = problem_of(filmed, seen, pictures=0)
+    fits = [fitted(problem, "newtonian", WRONG, 1e-6), fitted(problem, "neo_hookean", TRUE, 1e-2)]
+    assert picture_errors_of(problem, fits) == {}
+    assert [f.kind for f in nearest_first(fits, {})] == ["newtonian", "neo_hookean"]
+
+
+def test_what_diverges_comes_last(filmed, seen):  # noqa: F811
+    problem = problem_of(filmed, seen)
+    good = fitted(problem, "neo_hookean", TRUE, 1.0)
+    wild = dataclasses.replace(good, kind="newtonian", values={**good.values, **WRONG, "velocity_x": float("nan")})
+    errors = picture_errors_of(problem, [wild, good])
+    assert [f.kind for f in nearest_first([wild, good], errors)] == ["neo_hookean", "newtonian"]
+
+
+@pytest.mark.parametrize(("rich", "first"), [(0.095, "simple"), (0.08, "rich")])
+def test_more_parameters_must_be_nearer_by_a_tenth(rich, first):
+    fits = [FamilyFit(kind, "sticky", dict.fromkeys("abcd"[:k], 0.0)) for kind, k in (("rich", 4), ("simple", 2))]
+    assert nearest_first(fits, {"rich": rich, "simple": 0.1})[0].kind == first
