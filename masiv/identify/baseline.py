@@ -9,7 +9,7 @@ from typing import Any
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.classical_fit import FamilyFit, fit_all_particles, fit_family, information_criteria
+from masiv.identify.classical_fit import FamilyFit, fit_all_particles, fit_family, information_criteria, ranked
 from masiv.identify.families import FAMILIES
 from masiv.identify.fit import fit as fit_weights
 from masiv.identify.found import Found, history_rows
@@ -85,7 +85,8 @@ class Beside(Checkpoint):
 
 
 def _shortlisted(fit: Callable[..., FamilyFit], few: Problem) -> tuple[list[FamilyFit], dict[str, str]]:
-    """Short fits of every family, then the best ``FINALISTS`` in full; and why the others failed."""
+    """Short fits of every family, then in full the best ``FINALISTS`` by their paths and the best by the pictures
+    (which tell little of a fit that is far from its end); and why the others failed."""
     fits: dict[str, FamilyFit] = {}
     failures: dict[str, str] = {}
     for kind in FAMILIES:
@@ -96,7 +97,8 @@ def _shortlisted(fit: Callable[..., FamilyFit], few: Problem) -> tuple[list[Fami
     if not fits:
         raise MasivError(f"identify: no classical law explains the motion ({next(iter(failures.values()))})")
     short = list(fits.values())
-    for kind in [f.kind for f in nearest_first(short, picture_errors_of(few, short))[:FINALISTS]]:
+    finalists = [*ranked(short)[:FINALISTS], nearest_first(short, picture_errors_of(few, short))[0]]
+    for kind in dict.fromkeys(f.kind for f in finalists):
         fits[kind] = fit(kind, further=True)
     return list(fits.values()), failures
 
