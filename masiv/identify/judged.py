@@ -32,8 +32,8 @@ def nearest_first(fits: Sequence[FamilyFit], errors: Mapping[str, float]) -> lis
     """By the pictures' ``errors``, and of those that are within ``TELLS`` of the nearest the one with the fewest
     parameters first; by the information criterion of paths where there are none.
 
-    Paths of a body that flows are wrong, and a wrong law may be nearer to them: those of a viscous sphere prefer a
-    fluid with a yield stress by a quarter of their error, the pictures the true fluid by a third of theirs.
+    Paths of a body that flows are wrong, and a wrong law may be nearer to them: after short fits, those of a viscous
+    sphere prefer a fluid with a yield stress by a quarter of their error, the pictures the true fluid by a third.
     """
     if not errors:
         return ranked(list(fits))
