@@ -40,7 +40,7 @@ def identify_classical(
     )
     failures: dict[str, str] = {}
     if law == "auto":
-        fits, failures = _shortlisted(fit, few)
+        fits, failures = _shortlisted(fit, few, checkpoint)
     else:
         fits = [fit(law)]
     seen = picture_errors_of(few, fits) if law == "auto" else {}
@@ -84,7 +84,9 @@ class Beside(Checkpoint):
         super().save({**self.fixed, **state})
 
 
-def _shortlisted(fit: Callable[..., FamilyFit], few: Problem) -> tuple[list[FamilyFit], dict[str, str]]:
+def _shortlisted(
+    fit: Callable[..., FamilyFit], few: Problem, checkpoint: Checkpoint
+) -> tuple[list[FamilyFit], dict[str, str]]:
     """Short fits of every family, then in full the best ``FINALISTS`` by their paths and the best by the pictures
     (which tell little of a fit that is far from its end); and why the others failed."""
     fits: dict[str, FamilyFit] = {}
@@ -96,9 +98,13 @@ def _shortlisted(fit: Callable[..., FamilyFit], few: Problem) -> tuple[list[Fami
             failures[kind] = str(failed)
     if not fits:
         raise MasivError(f"identify: no classical law explains the motion ({next(iter(failures.values()))})")
-    short = list(fits.values())
-    finalists = [*ranked(short)[:FINALISTS], nearest_first(short, picture_errors_of(few, short))[0]]
-    for kind in dict.fromkeys(f.kind for f in finalists):
+    saved = checkpoint.load() or {}
+    if "finalists" not in saved:  # a fit that went on is no short one any more
+        short = list(fits.values())
+        best = [*ranked(short)[:FINALISTS], nearest_first(short, picture_errors_of(few, short))[0]]
+        saved["finalists"] = list(dict.fromkeys(f.kind for f in best))
+        checkpoint.save(saved)
+    for kind in saved["finalists"]:
         fits[kind] = fit(kind, further=True)
     return list(fits.values()), failures
 
