@@ -6,6 +6,8 @@ import pytest
 from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen  # noqa: F401  (fixtures)
 from test_polish import filmed, problem_of  # noqa: F401
 
+from masiv.checkpoint import Checkpoint
+from masiv.identify import baseline
 from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.families import motion_parameters
 from masiv.identify.judged import nearest_first, picture_errors_of
@@ -48,3 +50,23 @@ def test_what_diverges_comes_last(filmed, seen):  # noqa: F811
 def test_more_parameters_must_be_nearer_by_a_tenth(rich, first):
     fits = [FamilyFit(kind, "sticky", dict.fromkeys("abcd"[:k], 0.0)) for kind, k in (("rich", 4), ("simple", 2))]
     assert nearest_first(fits, {"rich": rich, "simple": 0.1})[0].kind == first
+
+
+def test_a_search_that_was_killed_goes_on_with_its_finalists(filmed, seen, tmp_path):  # noqa: F811
+    """A family that went on may be farther from the pictures than it was: another would take its place."""
+    checkpoint, gone_on = Checkpoint(tmp_path / "identify.pt"), []
+
+    def fit(kind, share=1.0, further=False):
+        gone_on.extend([kind] * further)
+        names = list(baseline.FAMILIES)
+        return FamilyFit(kind, "sticky", {}, mean_square=float(1 + (names.index(kind) + shift) % len(names)), samples=9)
+
+    problem, shift = problem_of(scene(), seen), 0
+    baseline._shortlisted(fit, problem, checkpoint)
+    first, shift = list(gone_on), 2
+    gone_on.clear()
+    baseline._shortlisted(fit, problem, checkpoint)
+    assert gone_on == first
+    gone_on.clear()
+    baseline._shortlisted(fit, problem, Checkpoint(None))
+    assert gone_on != first
