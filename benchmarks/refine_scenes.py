@@ -53,7 +53,7 @@ def measured(run, truth_file, second, given):
     config = RefineConfig.model_validate({**first.refine.model_dump(), **given})
     start = twin.fit.get("start") or twin.fit.get("law")
     loaded = time.time()
-    found = refine(throws, first.identify, first.simulator, config, start=start, seed=first.seed, progress=quiet)
+    found = refine(throws, first.identify, first.simulator, config, start=start, progress=quiet)
     done = time.time()
     document = summary(found, config, dry_run=False)
     effects = true_effects(truth)

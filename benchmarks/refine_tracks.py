@@ -106,7 +106,7 @@ def refined(case, config, with_oracle):
     whole = SampledMotion(motion.positions, motion.times, motion.volume)
     cut = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
     experiment, few, fewer, launch = experiment_of(
-        "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config, seed=0
+        "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
     )
     simulation = Simulation([experiment])
     began = time.time()

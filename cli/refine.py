@@ -75,7 +75,6 @@ def refine(
             settings.refine,
             start=twin.fit.get("start") or twin.fit.get("law"),
             dry_run=dry_run,
-            seed=settings.seed,
             checkpoint=folder.checkpoint("refine"),
             progress=progress,
         )

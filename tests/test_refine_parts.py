@@ -34,17 +34,17 @@ class Watched:
 
 
 class Linear:
-    """residual = matrix @ values - target; a finer grid changes ``change``."""
+    """residual = matrix @ values - target; finer grids make ``changes``."""
 
-    def __init__(self, matrix, target, change=None):
-        self.matrix, self.target, self.change = matrix, target, change
+    def __init__(self, matrix, target, *changes):
+        self.matrix, self.target, self.changes = matrix, target, changes
         self.experiments = (Watched(sigma=np.full(INSTANTS, NOISE)),)
 
     def residual(self, model, values):
         return self.matrix @ np.array([values["a"], values["b"]]) - self.target
 
-    def finer_grid(self, model, values, index):
-        return self.change
+    def finer_grids(self, model, values, index):
+        return list(self.changes)
 
 
 def parameters():
@@ -112,7 +112,9 @@ def test_what_a_fit_absorbs_is_no_uncertainty():
     rms = np.sqrt((other**2).sum(2).mean(1))
     assert (sigma[:ROWS] >= 0.8 * rms[:ROWS]).all()
     assert (np.diff(sigma) >= 0).all()
-    (sigma,) = uncertainties(Linear(jacobian, 0.0, None), fitted, [np.full(INSTANTS, NOISE)])
+    (both,) = uncertainties(Linear(jacobian, 0.0, other, absorbed), fitted, [np.full(INSTANTS, NOISE)])
+    np.testing.assert_allclose(both**2 - NOISE**2, (sigma**2 - NOISE**2) / 2, rtol=1e-3)  # one grid in two changes it
+    (sigma,) = uncertainties(Linear(jacobian, 0.0), fitted, [np.full(INSTANTS, NOISE)])
     np.testing.assert_array_equal(sigma, NOISE)
 
 

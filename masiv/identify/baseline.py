@@ -14,6 +14,7 @@ from masiv.identify.families import FAMILIES
 from masiv.identify.fit import fit as fit_weights
 from masiv.identify.found import Found, history_rows
 from masiv.identify.judged import nearest_first, picture_errors_of
+from masiv.identify.pictures import compared
 from masiv.identify.problem import Motion, Problem
 from masiv.materials.adapter import AdapterLaw
 from masiv.progress import Progress
@@ -42,7 +43,7 @@ def identify_classical(
     if law == "auto":
         fits, failures = _shortlisted(fit, few, checkpoint)
     else:
-        fits = [fit(law)]
+        fits = [fit(law, further=compared(few))]
     seen = picture_errors_of(few, fits) if law == "auto" else {}
     order = nearest_first(fits, seen)
     chosen = fit_all_particles(order[0], few, problem, checkpoint, progress)

@@ -1,7 +1,7 @@
 """Parameters of a classical law, velocity, spin and ground height by least squares through rollouts: the baselines.
 
-Coarse search over the law's scales and the contact, Gauss-Newton on few particles over a growing horizon, then
-chord steps on all particles. No adjoint is needed, so any law will do.
+Coarse search over the law's scales and the contact, Gauss-Newton on few particles over a growing horizon, first to
+paths, then with the pictures beside them, then chord steps on all particles. No adjoint is needed, so any law will do.
 """
 
 from __future__ import annotations
@@ -16,7 +16,17 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.correlation import effective_samples
 from masiv.identify.families import FAMILIES, Family, Rollouts, law_of, mean_distance, motion_of, motion_parameters
-from masiv.identify.parametric import FIRST_STEP, Estimate, Parameter, covariance, fit_parameters, robust_weight
+from masiv.identify.misfit import Misfit
+from masiv.identify.parametric import (
+    FIRST_STEP,
+    Estimate,
+    Parameter,
+    covariance,
+    fit_parameters,
+    robust_cost,
+    robust_weight,
+)
+from masiv.identify.pictures import compared
 from masiv.identify.problem import Motion, Problem
 from masiv.materials.classical import ClassicalLaw
 from masiv.progress import Progress
@@ -26,6 +36,8 @@ RECONSIDERED = 3
 LEAST_GAIN = 1e-3
 """A fit goes on while a step lowers the cost by this share."""
 CHORD_STEPS = 4
+WITH_PICTURES = 3
+"""Stage of ``FamilyFit`` from which pictures are fitted, too."""
 ALL = "all particles"
 
 
@@ -34,7 +46,8 @@ class FamilyFit:
     """What a family makes of a motion. values and stderr: law and throw (simulation frame), in each one's unit.
 
     error_m: mean distance to the trajectories over all frames. mean_square [m^2] and samples: of the residual and how
-    many independent ones it is worth. stage: how far the fit is (0 searched, 1 to 3 fitted on few particles, 4 on all).
+    many independent ones it is worth. stage: how far the fit is (0 searched; on few particles 1 and 2 fitted to paths,
+    3 with the pictures beside them, where there are some; 4 on all particles).
     """
 
     kind: str
@@ -109,8 +122,8 @@ def fit_family(
 ) -> FamilyFit:
     """``kind`` fitted on few particles. Goes on from, and saves after each stage to, ``checkpoint`` under its name.
 
-    share: of the rollouts that the configuration allows a stage. further: fit all frames once more from where such a
-    shortened fit ended. Raises MasivError where every start diverges.
+    share: of the rollouts that the configuration allows a stage. further: fit all frames once more from where that
+    ended, to the pictures, too, where there are some. Raises MasivError where every start diverges.
     """
     family = FAMILIES[kind].scaled(few.scene.density)
     saved = (checkpoint.load() or {}).get(kind)
@@ -145,22 +158,37 @@ def _stage(
     progress: Progress,
 ) -> FamilyFit:
     """Gauss-Newton over ``frames`` from what was found."""
-    rollouts = Rollouts(problem, family, found.contact, frames)
+    misfit = Misfit(problem, family, found.contact, frames, pictures=_with_pictures(problem, stage))
     done = 0
 
     def residual(values: dict[str, float]) -> np.ndarray:
         nonlocal done
         done += 1
-        here = rollouts.field(values)
-        progress(label, min(done, budget), budget, f"{1e3 * mean_distance(here):.1f} mm")
-        return here.ravel()
+        paths, squared = misfit(values)
+        progress(label, min(done, budget), budget, f"{1e3 * mean_distance(paths):.1f} mm")
+        return squared
 
     parameters = _parameters(problem, family, found)
-    estimate = fit_parameters(residual, parameters, max_evaluations=budget, robust=True, tolerance=LEAST_GAIN)
-    shape = (frames * problem.samples, problem.count, 3)
-    found = _updated(problem, found, estimate, estimate.residual.reshape(shape), stage)
+    # What a pixel may be off by is bounded, and most are not off at all: their median says nothing.
+    robust = not misfit.pictures
+    estimate = fit_parameters(residual, parameters, max_evaluations=budget, robust=robust, tolerance=LEAST_GAIN)
+    found = _updated(problem, found, _of_paths(estimate, misfit), stage)
     progress(label, budget, budget, f"{1e3 * found.error_m:.1f} mm")
     return found
+
+
+def _with_pictures(problem: Problem, stage: int) -> bool:
+    """Whether a fit at ``stage`` has pictures beside the paths."""
+    return stage >= WITH_PICTURES and compared(problem)
+
+
+def _of_paths(estimate: Estimate, misfit: Misfit) -> Estimate:
+    """What ``estimate`` says of paths, in metres, by which standard errors and information criteria are worked out:
+    neighbouring pixels are hardly independent."""
+    if not misfit.pictures:
+        return estimate
+    residual, jacobian = misfit.of_paths(estimate.residual), misfit.of_paths(estimate.jacobian)
+    return replace(estimate, residual=residual, jacobian=jacobian, covariance=covariance(jacobian, residual))
 
 
 def fit_all_particles(
@@ -178,29 +206,27 @@ def fit_all_particles(
     total = CHORD_STEPS + 2
     family = FAMILIES[found.kind].scaled(few.scene.density)
     parameters = _parameters(few, family, found)
+    pictures = _with_pictures(problem, found.stage)
     progress(label, 0, total)
-    coarse = fit_parameters(
-        Rollouts(few, family, found.contact, few.frames), parameters, max_evaluations=1, robust=True
-    )
+    on_few = Misfit(few, family, found.contact, few.frames, pictures=pictures)
+    coarse = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
     progress(label, 1, total)
-    rollouts = Rollouts(problem, family, found.contact, problem.frames)
-    softness = max(1.4826 * float(np.median(np.abs(coarse.residual))), 1e-12)
+    misfit = Misfit(problem, family, found.contact, problem.frames, pictures=pictures, chosen=few.chosen)
+    softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(coarse.residual))), 1e-12)
     values, jacobian, scale = found.values, coarse.jacobian, 1.0
-    best = rollouts.field(values)
-    residual = best[:, few.chosen].ravel()
+    best, residual = misfit(values)
     progress(label, 2, total, f"{1e3 * mean_distance(best):.1f} mm")
     for step in range(CHORD_STEPS):
         weight = robust_weight(residual, softness)
         full = np.linalg.lstsq(jacobian * weight[:, None], -residual * weight, rcond=None)[0]
         moved = _moved(parameters, values, scale * full)
         try:
-            field = rollouts.field(moved)
-            tried = field[:, few.chosen].ravel()
-            cost, before = (np.sqrt(1 + (r / softness) ** 2).sum() - len(r) for r in (tried, residual))
+            paths, tried = misfit(moved)
+            cost, before = (robust_cost(r, softness) for r in (tried, residual))
         except NonFiniteError:
             cost, before = math.inf, 1.0
         if cost < before:
-            values, residual, best = moved, tried, field
+            values, residual, best = moved, tried, paths
             if cost > (1 - LEAST_GAIN) * before:
                 break
         else:
@@ -209,7 +235,7 @@ def fit_all_particles(
     weight = robust_weight(residual, softness)
     spread = covariance(jacobian * weight[:, None], residual * weight)
     estimate = Estimate(values, spread, jacobian, residual, coarse.evaluations + CHORD_STEPS + 1, tuple(parameters))
-    found = _updated(few, found, estimate, residual.reshape(-1, few.count, 3), 4)
+    found = _updated(few, found, _of_paths(estimate, misfit), 4)
     found.error_m = mean_distance(best)
     _keep(checkpoint, found, f"{found.kind}, {ALL}")
     progress(label, total, total, f"{1e3 * found.error_m:.1f} mm")
@@ -242,7 +268,9 @@ def _parameters(problem: Problem, family: Family, found: FamilyFit) -> list[Para
     return [replace(p, start=float(np.clip(found.values[p.name], p.lower, p.upper))) for p in both]
 
 
-def _updated(problem: Problem, found: FamilyFit, estimate: Estimate, residual: np.ndarray, stage: int) -> FamilyFit:
+def _updated(problem: Problem, found: FamilyFit, estimate: Estimate, stage: int) -> FamilyFit:
+    """``found`` with what ``estimate``, whose residual is of paths [m], says."""
+    residual = estimate.residual.reshape(-1, problem.count, 3)
     samples = effective_samples(residual, problem.start.double().numpy())
     return replace(
         found,

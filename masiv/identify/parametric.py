@@ -110,9 +110,7 @@ class _Evaluator:
         return found
 
     def cost(self, found: np.ndarray) -> float:
-        if math.isinf(self.softness):
-            return float(found @ found)
-        return float((np.sqrt(1 + (found / self.softness) ** 2) - 1).sum())
+        return robust_cost(found, self.softness)
 
     def trial(self, u: np.ndarray) -> np.ndarray:
         """The residual, infinite where the simulation diverges: the trust region then shrinks."""
@@ -203,6 +201,13 @@ def fit_parameters(
         evaluator.count,
         evaluator.parameters,
     )
+
+
+def robust_cost(residual: np.ndarray, softness: float) -> float:
+    """What is made small: the sum of sqrt(1 + r^2 / s^2) - 1, or of squares where the ``softness`` s is infinite."""
+    if math.isinf(softness):
+        return float(residual @ residual)
+    return float((np.sqrt(1 + (residual / softness) ** 2) - 1).sum())
 
 
 def robust_weight(residual: np.ndarray, softness: float) -> np.ndarray:

@@ -4,6 +4,8 @@ against the colours."""
 from __future__ import annotations
 
 import functools
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,17 +90,31 @@ def picture_errors(
     Silhouettes: |alpha - mask| over the mask's area. Paint: ``masiv.identify.paint.paint_error``, 0 where
     ``problem.paint`` is None. positions (K, N, 3) [m, simulation frame] as ``Problem.run`` has them.
     """
+    parts = [(d.abs().sum() / area, paint) for d, area, paint in _beside(problem, positions, pictures)]
+    outlines, paints = zip(*parts, strict=True)
+    return torch.stack(outlines).mean(), torch.stack(paints).mean()
+
+
+def beside_pictures(
+    problem: Problem, positions: torch.Tensor, pictures: list[tuple[int, int]]
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """For each of ``pictures``, as in ``picture_errors``: alpha - mask (H, W) over the root of the mask's area, and the
+    paint's error."""
+    for difference, area, paint in _beside(problem, positions, pictures):
+        yield difference / math.sqrt(area), paint
+
+
+def _beside(
+    problem: Problem, positions: torch.Tensor, pictures: list[tuple[int, int]]
+) -> Iterator[tuple[torch.Tensor, float, torch.Tensor]]:
     from masiv.identify.paint import paint_error
 
     paint, nothing = problem.paint, torch.zeros(problem.count, 3)
-    outlines, colours = [], []
     for frame, view in pictures:
         seen = window(problem.scene, view, frame)
         points = to_world(problem, positions[frame * problem.samples - 1])
         difference, area = _outside(drawn(seen, points, problem.blob_size, nothing), seen)
-        outlines.append(difference.abs().sum() / area)
-        colours.append(torch.zeros(()) if paint is None else paint_error(paint, points, seen))
-    return torch.stack(outlines).mean(), torch.stack(colours).mean()
+        yield difference, area, torch.zeros(()) if paint is None else paint_error(paint, points, seen)
 
 
 @torch.no_grad()

@@ -60,9 +60,9 @@ class Motion:
 class Problem:
     """Rollouts of one body against its observed trajectories.
 
-    ``particles`` of the trajectory are used (all where None); targets (F * samples, N, 3) [m] are their positions in
-    the simulation frame at ``samples_per_frame`` instants a frame, the start left out. chosen (N,): which particles of
-    the trajectory they are. known: effects that act in every rollout which is given none.
+    chosen (N,): which particles of the trajectory are used (all where None). targets (F * samples, N, 3) [m] are their
+    positions in the simulation frame at ``samples_per_frame`` instants a frame, the start left out. known: effects that
+    act in every rollout which is given none.
     """
 
     def __init__(
@@ -72,8 +72,7 @@ class Problem:
         config: IdentifyConfig,
         simulator: SimulatorConfig,
         *,
-        particles: int | None = None,
-        seed: int = 0,
+        chosen: np.ndarray | None = None,
         known: tuple[TwinEffect, ...] = (),
     ) -> None:
         self.scene = scene
@@ -84,12 +83,9 @@ class Problem:
         self.frames = len(trajectory.times) - 1
         instants = np.arange(1, self.frames * self.samples + 1) / (self.samples * scene.fps)
         points = trajectory.evaluate(np.concatenate([[0.0], instants]))
-        self.chosen = np.arange(points.shape[1])
+        self.chosen = np.arange(points.shape[1]) if chosen is None else chosen
         on_surface = surface_points(points[0]) if config.geometry_loss == "surface" else None
-        if particles is not None and particles < points.shape[1]:
-            chosen = np.random.default_rng(seed).choice(points.shape[1], particles, replace=False)
-            self.chosen = np.sort(chosen)
-            points = points[:, self.chosen]
+        points = points[:, self.chosen]
         moved = torch.as_tensor(self.axes.points_to_simulation(points), dtype=torch.float32)
         self.start, self.targets = moved[0].contiguous(), moved[1:]
         self.surface = None if on_surface is None else torch.from_numpy(np.flatnonzero(on_surface[self.chosen]))

@@ -12,6 +12,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.baseline import identify_classical
 from masiv.identify.config import IdentifyConfig
+from masiv.identify.few import at_random
 from masiv.identify.launch import estimate_launch
 from masiv.identify.learn import learn
 from masiv.identify.problem import Motion, Problem
@@ -59,7 +60,8 @@ def _identify(
     axes = problem.axes
     motion = Motion.of_world(axes, launch.velocity, launch.omega)
     first_frames = min(launch.last_frame + 2, problem.frames)
-    few = functools.partial(Problem, scene, trajectory, config, simulator, particles=config.search_particles, seed=seed)
+    chosen = at_random(trajectory.positions.shape[1], config.search_particles, seed)
+    few = functools.partial(Problem, scene, trajectory, config, simulator, chosen=chosen)
     if config.law == "neural":
         found = learn(problem, few, motion, first_frames, seed, checkpoint, progress)
     else:
@@ -105,7 +107,8 @@ def relearn(
     Raises MasivError where no law explains ``trajectory``.
     """
     made = functools.partial(Problem, scene, trajectory, config, twin.simulator, known=twin.effects)
-    problem, few = made(), functools.partial(made, particles=config.search_particles, seed=seed)
+    chosen = at_random(trajectory.positions.shape[1], config.search_particles, seed)
+    problem, few = made(), functools.partial(made, chosen=chosen)
     axes = problem.axes
     raised = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
     motion = Motion.of_world(axes, twin.velocity, twin.omega, raised)

@@ -17,7 +17,9 @@ class RefineConfig(BaseModel):
     )  # fmt: skip
     particles: int = Field(1500, ge=100, description="particles of the rollouts")
     search_particles: int = Field(500, ge=100, description="particles of the short fits that choose the laws")
-    samples_per_frame: int = Field(2, ge=1, le=16, description="instants per frame at which motions are compared")
+    samples_per_frame: int = Field(
+        1, ge=1, le=16, description="instants per frame at which motions are compared; only whole frames are observed"
+    )
     families: int = Field(2, ge=1, description="classical laws that compete, the best by their fit without any effect")
     laws: list[str] = Field([], description="families that compete; all where empty")
     effects: list[str] = Field([], description="effects that are considered; the whole library where empty")

@@ -158,18 +158,15 @@ def _round(
             progress=lambda n, i, k, label=label: say(label, i, k, n),
         )  # fmt: skip
         say(label, 1, 1, candidates[0].effect if candidates else "none")
+        worth = [c for c in candidates if c.explained >= config.least_explained]
+        within = [c for c in worth[: config.shortlist] if early or in_reach(c, base, trials)]
+        trials += _trials(simulation, early, start, within, soft, say, workers)
+        if not ranking and _leaves_much(trials, simulation, config):
+            # The ranking is linear: a cause that acts at a place may be far down in it.
+            trials += _trials(
+                simulation, early, start, worth[config.shortlist : 2 * config.shortlist], soft, say, workers
+            )
         ranking = ranking or candidates
-        worth = [c for c in candidates if c.explained >= config.least_explained][: config.shortlist]
-        worth = [c for c in worth if early or in_reach(c, base, trials)]
-        label = f"refine: fit effects, {base.model.family.kind}"
-        fits = side_by_side(workers, simulation, _fitted, [(early, start, candidate, soft) for candidate in worth])
-        say(label, 0, len(worth), ", ".join(c.effect for c in worth))
-        for done, (candidate, fitted) in enumerate(zip(worth, fits, strict=True)):
-            if isinstance(fitted, Failed):
-                say(label, done + 1, len(worth), f"{candidate.effect}: {fitted.reason}")
-            else:
-                trials.append(Trial(candidate, fitted))
-                say(label, done + 1, len(worth), candidate.effect)
     _rank(trials)
     if trials:
         _second_chance(simulation, trials, soft, say, workers)
@@ -190,6 +187,37 @@ def _round(
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, alike, or_else if accepted else [])
+
+
+def _trials(
+    simulation: Simulated,
+    early: Sequence[Simulated],
+    start: Fitted,
+    candidates: Sequence[Candidate],
+    soft: float,
+    say: Say,
+    workers: Workers,
+) -> list[Trial]:
+    """``start`` with each of the ``candidates``, those that cannot be simulated left out."""
+    label = f"refine: fit effects, {start.model.family.kind}"
+    fits = side_by_side(workers, simulation, _fitted, [(early, start, candidate, soft) for candidate in candidates])
+    say(label, 0, len(candidates), ", ".join(c.effect for c in candidates))
+    trials = []
+    for done, (candidate, fitted) in enumerate(zip(candidates, fits, strict=True)):
+        if isinstance(fitted, Failed):
+            say(label, done + 1, len(candidates), f"{candidate.effect}: {fitted.reason}")
+        else:
+            trials.append(Trial(candidate, fitted))
+            say(label, done + 1, len(candidates), candidate.effect)
+    return trials
+
+
+def _leaves_much(trials: Sequence[Trial], simulation: Simulated, config: RefineConfig) -> bool:
+    """Whether the best of ``trials`` leaves more than noise and grid explain."""
+    if not trials:
+        return False
+    best = min((t.fitted for t in trials), key=lambda f: f.cost)
+    return excess(best, simulation.experiments) > config.above_noise
 
 
 def in_reach(candidate: Candidate, base: Fitted, trials: Sequence[Trial]) -> bool:

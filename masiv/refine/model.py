@@ -29,7 +29,7 @@ LOST, SHOWS = 0.25, 0.05
 class Experiment(Weighing):
     """One throw: rollouts of the body against its observed motion, of which frames 1…fitted-1 may be fitted.
 
-    motion: of ``problem``'s start, simulation frame. fine: the same on a finer grid with all particles, of which those
+    motion: of ``problem``'s start, simulation frame. finer: the same on finer grids with all particles, of which those
     of ``problem`` are some. noise: of the observation [m]. sigma (K,): by how much model and observation may differ at
     each instant [m] with nothing missing; the noise while the rest is not known.
     """
@@ -38,7 +38,7 @@ class Experiment(Weighing):
     problem: Problem
     fitted: int
     motion: Motion
-    fine: Problem | None
+    finer: tuple[Problem, ...]
     noise: float
     sigma: np.ndarray
 
@@ -207,12 +207,11 @@ class Simulation:
         return np.concatenate([e.weighted(f).ravel() for e, f in found])
 
     @torch.no_grad()
-    def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
-        """What a finer grid with more particles changes: (K, N, 3) [m] of the particles of experiment ``index`` over
-        all frames, or None where there is none. Raises NonFiniteError."""
+    def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
+        """What each finer grid with more particles changes: (K, N, 3) [m] of the particles of experiment ``index`` over
+        all frames. Raises NonFiniteError."""
         experiment = self.experiments[index]
-        if experiment.fine is None:
-            return None
-        frames = experiment.problem.frames
-        fine = _run(experiment.fine, experiment, model, values, frames, None)[:, experiment.problem.chosen]
-        return (fine - self.positions(model, values, index, frames)).double().numpy()
+        problem = experiment.problem
+        own = self.positions(model, values, index, problem.frames)
+        runs = (_run(finer, experiment, model, values, problem.frames, None) for finer in experiment.finer)
+        return [(run[:, problem.chosen] - own).double().numpy() for run in runs]

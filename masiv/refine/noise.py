@@ -31,21 +31,29 @@ def noise_floor(positions: np.ndarray, last_frame: int) -> float:
 
 def uncertainties(simulation: Simulated, fitted: Fitted, observation: Sequence[np.ndarray]) -> list[np.ndarray]:
     """For each experiment, the root mean square distance (K,) [m] by which model and observation may differ at each
-    instant with nothing missing: that of the ``observation`` (K,), and what a finer grid changes and no fit could
-    absorb. In free flight that is nothing.
+    instant with nothing missing: that of the ``observation`` (K,), and what finer grids change and no fit could
+    absorb, on average. In free flight that is nothing.
 
-    What a fit absorbs is the change's part along the derivatives of ``fitted``; after the fitted instants, the same
-    share as at the end of these is taken to be absorbed. Not less than before as time goes on, since errors of the
-    simulation grow. Raises NonFiniteError.
+    Not less than before as time goes on, since errors of the simulation grow. Raises NonFiniteError.
+    """
+    found = [simulation.finer_grids(fitted.model, fitted.values, k) for k in range(len(simulation.experiments))]
+    kept = [_not_absorbed(simulation, fitted, observation, changes) for changes in zip(*found, strict=True)]
+    if not kept:
+        return list(observation)
+    grids = (np.sqrt(np.mean(np.square(each), axis=0)) for each in zip(*kept, strict=True))
+    return [np.hypot(seen, np.maximum.accumulate(g)) for seen, g in zip(observation, grids, strict=True)]
+
+
+def _not_absorbed(
+    simulation: Simulated, fitted: Fitted, observation: Sequence[np.ndarray], changes: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """For each experiment, the root mean square (K,) [m] of what another grid ``changes`` (K, N, A) and no fit absorbs.
+
+    A fit absorbs the change's part along the derivatives of ``fitted``; after the fitted instants, the same share as at
+    the end of these is taken to be absorbed.
     """
     experiments = simulation.experiments
-    changes = []
-    for index, experiment in enumerate(experiments):
-        change = simulation.finer_grid(fitted.model, fitted.values, index)
-        changes.append(np.zeros((experiment.instants, 1, 1)) if change is None else change)
     whole = [np.sqrt((change**2).sum(2).mean(1)) for change in changes]
-    if not any(size.any() for size in whole):
-        return list(observation)
     weights = [
         e.noise / np.hypot(seen, np.maximum.accumulate(size))
         for size, seen, e in zip(whole, observation, experiments, strict=True)
@@ -60,11 +68,10 @@ def uncertainties(simulation: Simulated, fitted: Fitted, observation: Sequence[n
     flat = np.concatenate([part.ravel() for part in rows])
     left = flat - jacobian @ (np.linalg.lstsq(jacobian / scale, flat, rcond=1e-8)[0] / scale)
     out = []
-    for part, size, weight, experiment, seen, mine in zip(
-        rows, whole, weights, experiments, observation, np.split(left, np.cumsum(counts)[:-1]), strict=True
+    for part, size, weight, experiment, mine in zip(
+        rows, whole, weights, experiments, np.split(left, np.cumsum(counts)[:-1]), strict=True
     ):
         kept = np.sqrt((mine.reshape(part.shape) ** 2).sum(2).mean(1)) / weight[: experiment.rows]
         share = min(float(kept[-1] / max(size[experiment.rows - 1], 1e-300)), 1.0)
-        grid = np.concatenate([np.minimum(kept, size[: experiment.rows]), share * size[experiment.rows :]])
-        out.append(np.hypot(seen, np.maximum.accumulate(grid)))
+        out.append(np.concatenate([np.minimum(kept, size[: experiment.rows]), share * size[experiment.rows :]]))
     return out

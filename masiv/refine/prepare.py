@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from masiv.identify.config import IdentifyConfig
+from masiv.identify.few import well_spread
 from masiv.identify.launch import Launch, estimate_launch
 from masiv.identify.problem import Motion, Problem
 from masiv.mpm.config import SimulatorConfig
@@ -19,8 +20,9 @@ from masiv.scene.scene import Scene
 LEAST_PER_CELL = 2.0
 LEAST_NOISE = 1e-6
 """[m], about what single precision leaves of a position."""
-FINER = 0.5
-"""Particles per cell, of the twin's, on the grid that says what the twin's own grid may change."""
+FINER = (1.0, 0.5)
+"""Particles per cell, of the twin's, on the grids that say what another grid may change. Where a body bounces they do
+not come nearer to each other as they get finer, so that one of them is one draw of that error."""
 
 
 def experiment_of(
@@ -31,8 +33,6 @@ def experiment_of(
     identify: IdentifyConfig,
     simulator: SimulatorConfig,
     config: RefineConfig,
-    *,
-    seed: int,
 ) -> tuple[Experiment, Problem, Problem, Launch]:
     """The experiment, the problem of its fitted frames alone (on the same particles), that on few particles, and the
     launch.
@@ -42,10 +42,11 @@ def experiment_of(
     settings = identify.model_copy(update={"samples_per_frame": config.samples_per_frame})
     count = fitted.positions.shape[1]
     on_few, on_fewer = (thinned(simulator, min(n / count, 1.0)) for n in (config.particles, config.search_particles))
-    few = Problem(scene, fitted, settings, on_few, particles=config.particles, seed=seed)
-    fewer = Problem(scene, fitted, settings, on_fewer, particles=config.search_particles, seed=seed)
-    fine = Problem(scene, whole, settings, thinned(simulator, FINER))
-    problem = Problem(scene, whole, settings, on_few, particles=config.particles, seed=seed)
+    chosen, fewest = (well_spread(fitted.positions[0], n) for n in (config.particles, config.search_particles))
+    few = Problem(scene, fitted, settings, on_few, chosen=chosen)
+    fewer = Problem(scene, fitted, settings, on_fewer, chosen=fewest)
+    finer = tuple(Problem(scene, whole, settings, thinned(simulator, share)) for share in FINER)
+    problem = Problem(scene, whole, settings, on_few, chosen=chosen)
     problem.targets[: len(few.targets)] = few.targets
     problem.start = few.start
     launch = estimate_launch(fitted.positions, fitted.times, scene.gravity, scene.ground, clearance=few.spacing)
@@ -54,7 +55,7 @@ def experiment_of(
     seen = torch.cat([problem.start[None], problem.targets]).double().numpy()
     lost = config.tracking_error * beyond_rigid(seen) if scene.cameras else np.zeros(len(problem.targets))
     sigma = np.hypot(noise, np.maximum.accumulate(lost))
-    return Experiment(name, problem, len(fitted.times), motion, fine, noise, sigma), few, fewer, launch
+    return Experiment(name, problem, len(fitted.times), motion, finer, noise, sigma), few, fewer, launch
 
 
 def thinned(simulator: SimulatorConfig, share: float) -> SimulatorConfig:

@@ -150,8 +150,9 @@ class Simulated(Protocol):
         """The fitted instants of all experiments, weighted, flat."""
         ...
 
-    def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
-        """What a finer grid changes, as a field over all instants of experiment ``index``; None: there is no finer."""
+    def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
+        """What each finer grid changes, as a field over all instants of experiment ``index``; none: there is no finer,
+        or it tells nothing. All experiments have as many."""
         ...
 
     def early(self, base: Fitted) -> Sequence[Simulated]:

@@ -72,7 +72,6 @@ def refine(
     *,
     start: str | None = None,
     dry_run: bool = False,
-    seed: int = 0,
     checkpoint: Checkpoint | None = None,
     progress: Progress = silent,
 ) -> Refined:
@@ -87,9 +86,7 @@ def refine(
         if not config.laws and start in COMPETITORS:
             config = config.model_copy(update={"laws": list(COMPETITORS[start])})
         made = [
-            experiment_of(
-                t.name, t.scene, first_frames(t.motion, t.fitted), t.whole, identify, simulator, config, seed=seed
-            )
+            experiment_of(t.name, t.scene, first_frames(t.motion, t.fitted), t.whole, identify, simulator, config)
             for t in throws
         ]
         simulation = Simulation([experiment for experiment, *_ in made])

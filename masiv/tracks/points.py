@@ -294,9 +294,9 @@ class PointSimulation:
         found = zip(self.experiments, self.fields(model, values), strict=True)
         return np.concatenate([run.weighted(f).ravel() for run, f in found])
 
-    def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
+    def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
         """None: there is no grid, and a quarter of the substep changes less than a micrometre."""
-        return None
+        return []
 
     def by_body(self, model: Model, values: Mapping[str, float], *, fitted: bool) -> dict[str, float]:
         """Error [mm] of each body over its runs that are fitted, or that are held out."""

@@ -329,9 +329,9 @@ class BodySimulation:
         found = zip(self.experiments, self.fields(model, values), strict=True)
         return np.concatenate([run.weighted(f).ravel() for run, f in found])
 
-    def finer_grid(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray | None:
+    def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
         """None: over many periods two grids are out of phase, which would hide all else. See benchmarks/measured.md."""
-        return None
+        return []
 
     def early(self, base: Fitted) -> Sequence[BodySimulation]:
         """The first moments, then ever more, where the phase is lost. None where they are left out: an effective start

@@ -1,0 +1,67 @@
+"""A classical law is fitted to pictures in the end, where there are some: paths drift, they do not."""
+
+import numpy as np
+import pytest
+from test_identify import OMEGA, VELOCITY, Seen, body, scene, seen  # noqa: F401  (fixtures)
+from test_polish import filmed, problem_of  # noqa: F401
+
+from masiv.checkpoint import Checkpoint
+from masiv.identify.classical_fit import fit_all_particles, fit_family
+from masiv.identify.families import FAMILIES, motion_parameters
+from masiv.identify.misfit import Misfit
+from masiv.identify.problem import Motion
+
+TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
+DRIFT = np.array([0.25, 0.0, 0.0])
+"""[m/s]"""
+
+
+def values_of(problem, **changes):
+    throw = motion_parameters(problem, Motion.of_world(problem.axes, VELOCITY, OMEGA))
+    return {**TRUE, **{p.name: p.start for p in throw}, **changes}
+
+
+def test_paths_come_first_and_are_metres_again(filmed, seen):  # noqa: F811
+    problem = problem_of(filmed, seen, samples_per_frame=2)
+    plain, both = (Misfit(problem, FAMILIES["neo_hookean"], "sticky", 3, pictures=p) for p in (False, True))
+    paths, squared = both(values_of(problem))
+    assert paths.shape == (6, problem.count, 3)
+    np.testing.assert_allclose(both.of_paths(squared), paths.ravel(), rtol=1e-6)
+    alone, flat = plain(values_of(problem))
+    np.testing.assert_array_equal(alone, paths)
+    np.testing.assert_array_equal(flat, paths.ravel())
+    rows = np.random.default_rng(0).normal(size=(len(squared), 2))
+    assert both.of_paths(rows).shape == (paths.size, 2)
+    mean_square = float((paths**2).sum(2).mean()) / problem.size**2
+    assert (squared[: paths.size] ** 2).sum() == pytest.approx(mean_square, rel=1e-4)
+
+
+def test_pictures_are_nearest_at_the_truth(filmed, seen):  # noqa: F811
+    problem = problem_of(filmed, seen)
+    misfit = Misfit(problem, FAMILIES["neo_hookean"], "sticky", problem.frames, pictures=True)
+
+    def of_pictures(**changes):
+        _, squared = misfit(values_of(problem, **changes))
+        return float((squared[misfit.rows :] ** 2).sum())
+
+    here = of_pictures()
+    for changes in ({"velocity_x": 0.7}, {"velocity_x": 0.3}, {"youngs_modulus": 1.2e4}, {"ground_offset": 0.02}):
+        assert of_pictures(**changes) > 1.02 * here
+
+
+def test_paths_that_drift_are_overruled(filmed, seen):  # noqa: F811
+    true = seen[0]
+    drift = (DRIFT * true.times[:, None, None]).astype(np.float32)
+    drifted = Seen(true.positions + drift, true.times, true.volume), seen[1]
+    off = []
+    for pictures in (0, 4):
+        problem = problem_of(filmed, drifted, pictures=pictures, family_rollouts=25, samples_per_frame=1)
+        begun = Motion.of_world(problem.axes, VELOCITY + DRIFT, OMEGA)
+        found = fit_family(
+            "neo_hookean", problem, begun, problem.frames, Checkpoint(None), lambda *_: None, further=True
+        )
+        assert found.stage == 3
+        found = fit_all_particles(found, problem, problem, Checkpoint(None), lambda *_: None)
+        off.append(abs(found.values["velocity_x"] - VELOCITY[0]))
+    assert off[0] > 0.8 * DRIFT[0]
+    assert off[1] < 0.3 * DRIFT[0]
