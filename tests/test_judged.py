@@ -12,6 +12,7 @@ from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.families import motion_parameters
 from masiv.identify.judged import nearest_first, picture_errors_of
 from masiv.identify.problem import Motion
+from masiv.workers import Workers
 
 TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
 WRONG = {"viscosity": 40.0, "bulk_modulus": 1e5}
@@ -52,21 +53,33 @@ def test_more_parameters_must_be_nearer_by_a_tenth(rich, first):
     assert nearest_first(fits, {"rich": rich, "simple": 0.1})[0].kind == first
 
 
-def test_a_search_that_was_killed_goes_on_with_its_finalists(filmed, seen, tmp_path):  # noqa: F811
+def test_a_search_that_was_killed_goes_on_with_its_finalists(filmed, seen, tmp_path, monkeypatch):  # noqa: F811
     """A family that went on may be farther from the pictures than it was: another would take its place."""
-    checkpoint, gone_on = Checkpoint(tmp_path / "identify.pt"), []
+    checkpoint, gone_on, shift = Checkpoint(tmp_path / "identify.pt"), [], 0
 
-    def fit(kind, share=1.0, further=False):
-        gone_on.extend([kind] * further)
+    def fit(kind, *_, **__):
         names = list(baseline.FAMILIES)
         return FamilyFit(kind, "sticky", {}, mean_square=float(1 + (names.index(kind) + shift) % len(names)), samples=9)
 
-    problem, shift = problem_of(scene(), seen), 0
-    baseline._shortlisted(fit, problem, checkpoint)
-    first, shift = list(gone_on), 2
-    gone_on.clear()
-    baseline._shortlisted(fit, problem, checkpoint)
-    assert gone_on == first
-    gone_on.clear()
-    baseline._shortlisted(fit, problem, Checkpoint(None))
-    assert gone_on != first
+    def further(found, *_, **__):
+        gone_on.append(found.kind)
+        if len(gone_on) == stop:
+            raise KeyboardInterrupt
+        return dataclasses.replace(found, stage=3, mean_square=1e6)
+
+    monkeypatch.setattr(baseline, "fit_family", fit)
+    monkeypatch.setattr(baseline, "fit_further", further)
+    problem = problem_of(scene(), seen)
+
+    def shortlisted(kept):
+        gone_on.clear()
+        baseline._shortlisted(problem, None, 1, False, kept, lambda *_: None, Workers())
+        return list(gone_on)
+
+    stop = 2
+    with pytest.raises(KeyboardInterrupt):
+        shortlisted(checkpoint)
+    first, stop = list(gone_on), 0
+    shift = 2
+    assert shortlisted(checkpoint) == first
+    assert shortlisted(Checkpoint(None)) != first

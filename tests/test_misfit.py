@@ -1,15 +1,19 @@
 """A classical law is fitted to pictures in the end, where there are some: paths drift, they do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_identify import OMEGA, VELOCITY, Seen, body, scene, seen  # noqa: F401  (fixtures)
 from test_polish import filmed, problem_of  # noqa: F401
 
 from masiv.checkpoint import Checkpoint
-from masiv.identify.classical_fit import fit_all_particles, fit_family
+from masiv.identify.classical_fit import fit_all_particles, fit_family, fit_further, search
 from masiv.identify.families import FAMILIES, motion_parameters
 from masiv.identify.misfit import Misfit
 from masiv.identify.problem import Motion
+from masiv.materials.classical import ClassicalLaw
+from masiv.progress import silent
 
 TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
 DRIFT = np.array([0.25, 0.0, 0.0])
@@ -54,14 +58,25 @@ def test_paths_that_drift_are_overruled(filmed, seen):  # noqa: F811
     drift = (DRIFT * true.times[:, None, None]).astype(np.float32)
     drifted = Seen(true.positions + drift, true.times, true.volume), seen[1]
     off = []
-    for pictures in (0, 4):
-        problem = problem_of(filmed, drifted, pictures=pictures, family_rollouts=25, samples_per_frame=1)
-        begun = Motion.of_world(problem.axes, VELOCITY + DRIFT, OMEGA)
+    problem = problem_of(filmed, drifted, family_rollouts=25, samples_per_frame=1)
+    begun = Motion.of_world(problem.axes, VELOCITY + DRIFT, OMEGA)
+    for pictures in (False, True):
         found = fit_family(
-            "neo_hookean", problem, begun, problem.frames, Checkpoint(None), lambda *_: None, further=True
+            "neo_hookean", problem, begun, problem.frames, Checkpoint(None), silent, share=0.5, pictures=pictures
         )
-        assert found.stage == 3
-        found = fit_all_particles(found, problem, problem, Checkpoint(None), lambda *_: None)
+        found = fit_further(found, problem, silent, pictures=pictures)
+        found = fit_all_particles(found, problem, problem, Checkpoint(None), silent, pictures=pictures)
         off.append(abs(found.values["velocity_x"] - VELOCITY[0]))
     assert off[0] > 0.8 * DRIFT[0]
     assert off[1] < 0.3 * DRIFT[0]
+
+
+def test_the_search_of_a_start_looks_at_pictures_too(filmed, seen, monkeypatch):  # noqa: F811
+    """Paths as a body twenty times as stiff would have them."""
+    law = ClassicalLaw("neo_hookean", youngs_modulus=6e5, poissons_ratio=0.3)
+    problem = problem_of(filmed, seen, silhouette_weight=5.0, paint_weight=0.0)
+    problem.targets = problem.run(law, Motion.of_world(problem.axes, VELOCITY, OMEGA), "sticky", problem.frames)
+    family = replace(FAMILIES["neo_hookean"], search={"youngs_modulus": (3e4, 6e5)})
+    thrown = Motion.of_world(problem.axes, VELOCITY, OMEGA)
+    found = [search(problem, family, thrown, silent, pictures=p).values["youngs_modulus"] for p in (False, True)]
+    assert found == [6e5, 3e4]

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.classical_fit import FamilyFit, fit_all_particles, fit_family, information_criteria, ranked
+from masiv.identify.classical_fit import (
+    FamilyFit,
+    fit_all_particles,
+    fit_family,
+    fit_further,
+    information_criteria,
+    keep,
+    ranked,
+)
 from masiv.identify.families import FAMILIES
 from masiv.identify.fit import fit as fit_weights
 from masiv.identify.found import Found, history_rows
 from masiv.identify.judged import nearest_first, picture_errors_of
-from masiv.identify.pictures import compared
+from masiv.identify.polish import wanted
 from masiv.identify.problem import Motion, Problem
 from masiv.materials.adapter import AdapterLaw
-from masiv.progress import Progress
+from masiv.progress import Progress, silent
+from masiv.workers import Failed, Workers, processes_wanted
 
 SHORT = 1 / 3
 FINALISTS = 2
@@ -36,17 +44,16 @@ def identify_classical(
     """``problem.config.law`` is a family, auto or adapter. Raises MasivError where no family explains the motion."""
     config = problem.config
     law = config.adapter_base if config.law == "adapter" else config.law
-    fit = functools.partial(
-        fit_family, few=few, motion=motion, first_frames=first_frames, checkpoint=checkpoint, progress=progress
-    )
+    pictures = wanted(problem)
     failures: dict[str, str] = {}
     if law == "auto":
-        fits, failures = _shortlisted(fit, few, checkpoint)
+        with Workers(processes_wanted(config.processes), "identify.processes") as workers:
+            fits, failures = _shortlisted(few, motion, first_frames, pictures, checkpoint, progress, workers)
     else:
-        fits = [fit(law, further=compared(few))]
+        fits = [fit_family(law, few, motion, first_frames, checkpoint, progress, pictures=pictures)]
     seen = picture_errors_of(few, fits) if law == "auto" else {}
     order = nearest_first(fits, seen)
-    chosen = fit_all_particles(order[0], few, problem, checkpoint, progress)
+    chosen = fit_all_particles(order[0], few, problem, checkpoint, progress, pictures=pictures)
     errors = {name: _known(chosen.stderr[name]) for name in chosen.values if name not in chosen.law.values}
     report: dict[str, Any] = {
         "law": chosen.kind,
@@ -66,8 +73,9 @@ def identify_classical(
         return Found(chosen.law, chosen.motion, chosen.contact, chosen.error_m, report)
     start = AdapterLaw(chosen.law, rank=config.adapter_rank, seed=seed).float()
     start.base.double()
+    learnt_from = problem.of_surfaces(config.iterations) if pictures else problem  # paths led the classical law
     fitted = fit_weights(
-        problem, start, chosen.motion, chosen.contact, problem.frames,  # the classical law was fitted to all frames
+        learnt_from, start, chosen.motion, chosen.contact, problem.frames,  # the classical law was fitted to all frames
         seed=seed, checkpoint=Beside(checkpoint), progress=progress,
     )  # fmt: skip
     report["classical_error_mm"] = 1e3 * chosen.error_m
@@ -86,28 +94,54 @@ class Beside(Checkpoint):
 
 
 def _shortlisted(
-    fit: Callable[..., FamilyFit], few: Problem, checkpoint: Checkpoint
-) -> tuple[list[FamilyFit], dict[str, str]]:
+    few: Problem, motion: Motion, first_frames: int, pictures: bool,
+    checkpoint: Checkpoint, progress: Progress, workers: Workers,
+) -> tuple[list[FamilyFit], dict[str, str]]:  # fmt: skip
     """Short fits of every family, then in full the best ``FINALISTS`` by their paths and the best by the pictures
     (which tell little of a fit that is far from its end); and why the others failed."""
-    fits: dict[str, FamilyFit] = {}
+    saved = checkpoint.load() or {}
+    fits = {kind: FamilyFit(**saved[kind]) for kind in FAMILIES if kind in saved}
     failures: dict[str, str] = {}
-    for kind in FAMILIES:
-        try:
-            fits[kind] = fit(kind, share=SHORT)
-        except MasivError as failed:
-            failures[kind] = str(failed)
+    heard = progress if workers.processes == 1 else silent
+
+    def done(kinds: Sequence[str], found: Iterable[FamilyFit | Failed], label: str) -> None:
+        progress(label, 0, len(kinds), ", ".join(kinds))
+        for k, (kind, fit) in enumerate(zip(kinds, found, strict=True)):
+            if isinstance(fit, Failed):
+                failures[kind] = fit.reason
+                note = f"{kind}: {fit.reason}"
+            else:
+                fits[kind] = fit
+                keep(checkpoint, fit)
+                note = f"{kind}: {1e3 * fit.error_m:.1f} mm"
+            progress(label, k + 1, len(kinds), note)
+
+    missing = [kind for kind in FAMILIES if kind not in fits]
+    tasks = [(kind, few, motion, first_frames, pictures, heard) for kind in missing]
+    done(missing, workers.map(_short_fit, tasks), "identify: classical laws, in short")
     if not fits:
         raise MasivError(f"identify: no classical law explains the motion ({next(iter(failures.values()))})")
-    saved = checkpoint.load() or {}
     if "finalists" not in saved:  # a fit that went on is no short one any more
         short = list(fits.values())
         best = [*ranked(short)[:FINALISTS], nearest_first(short, picture_errors_of(few, short))[0]]
-        saved["finalists"] = list(dict.fromkeys(f.kind for f in best))
+        saved = {**(checkpoint.load() or {}), "finalists": list(dict.fromkeys(f.kind for f in best))}
         checkpoint.save(saved)
-    for kind in saved["finalists"]:
-        fits[kind] = fit(kind, further=True)
+    kinds = saved["finalists"]
+    tasks = [(fits[kind], few, pictures, heard) for kind in kinds]
+    done(kinds, workers.map(_further_fit, tasks), "identify: classical laws, the best")
     return list(fits.values()), failures
+
+
+def _short_fit(
+    kind: str, few: Problem, motion: Motion, first_frames: int, pictures: bool, progress: Progress
+) -> FamilyFit:
+    return fit_family(
+        kind, few, motion, first_frames, Checkpoint(None), progress, share=SHORT, pictures=pictures
+    )  # fmt: skip
+
+
+def _further_fit(found: FamilyFit, few: Problem, pictures: bool, progress: Progress) -> FamilyFit:
+    return fit_further(found, few, progress, pictures=pictures)
 
 
 def family_rows(order: list[FamilyFit], pictures: Mapping[str, float]) -> list[dict[str, Any]]:

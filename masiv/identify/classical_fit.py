@@ -1,7 +1,7 @@
 """Parameters of a classical law, velocity, spin and ground height by least squares through rollouts: the baselines.
 
-Coarse search over the law's scales and the contact, Gauss-Newton on few particles over a growing horizon, first to
-paths, then with the pictures beside them, then chord steps on all particles. No adjoint is needed, so any law will do.
+Coarse search over the law's scales and the contact, Gauss-Newton on few particles over a growing horizon, then
+chord steps on all particles, each to paths, or with the pictures beside them. No adjoint is needed, so any law will do.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.correlation import effective_samples
 from masiv.identify.families import FAMILIES, Family, Rollouts, law_of, mean_distance, motion_of, motion_parameters
 from masiv.identify.misfit import Misfit
+from masiv.identify.objective import objective
 from masiv.identify.parametric import (
     FIRST_STEP,
     Estimate,
@@ -26,7 +28,6 @@ from masiv.identify.parametric import (
     robust_cost,
     robust_weight,
 )
-from masiv.identify.pictures import compared
 from masiv.identify.problem import Motion, Problem
 from masiv.materials.classical import ClassicalLaw
 from masiv.progress import Progress
@@ -36,8 +37,7 @@ RECONSIDERED = 3
 LEAST_GAIN = 1e-3
 """A fit goes on while a step lowers the cost by this share."""
 CHORD_STEPS = 4
-WITH_PICTURES = 3
-"""Stage of ``FamilyFit`` from which pictures are fitted, too."""
+FURTHER = 3
 ALL = "all particles"
 
 
@@ -46,8 +46,7 @@ class FamilyFit:
     """What a family makes of a motion. values and stderr: law and throw (simulation frame), in each one's unit.
 
     error_m: mean distance to the trajectories over all frames. mean_square [m^2] and samples: of the residual and how
-    many independent ones it is worth. stage: how far the fit is (0 searched; on few particles 1 and 2 fitted to paths,
-    3 with the pictures beside them, where there are some; 4 on all particles).
+    many independent ones it is worth. stage: how far the fit is (0 searched, 1 to 3 fitted on few particles, 4 on all).
     """
 
     kind: str
@@ -75,38 +74,42 @@ class FamilyFit:
         return asdict(self)
 
 
-def search(problem: Problem, family: Family, motion: Motion, progress: Progress) -> FamilyFit:
+def search(problem: Problem, family: Family, motion: Motion, progress: Progress, *, pictures: bool) -> FamilyFit:
     """The best of ``Family.candidates``, each with the contact that the configuration names, or the best ones with
-    each. Raises MasivError where all diverge."""
+    each, by their paths, or, as the starts of a neural law, by these and the pictures. Raises MasivError where all
+    diverge."""
     contacts = ["sticky", "release"] if problem.config.contact == "auto" else [problem.config.contact]
     if problem.scene.ground is None:
         contacts = ["none"]
     throw = {p.name: p.start for p in motion_parameters(problem, motion)}
     candidates = family.candidates()
     extra = (len(contacts) - 1) * min(RECONSIDERED, len(candidates))
-    found: list[tuple[float, int, str]] = []
+    found: list[tuple[float, int, str, float]] = []
 
     def tried(index: int, contact: str) -> None:
         values = {**candidates[index], **throw}
         try:
-            error = mean_distance(Rollouts(problem, family, contact, problem.frames).field(values))
+            field = Rollouts(problem, family, contact, problem.frames).field(values)
+            distance = mean_distance(field)
+            moved = torch.from_numpy(field).float() + problem.targets[: len(field)]
+            error = objective(problem, moved) if pictures else distance
         except NonFiniteError:
-            error = math.inf
-        found.append((error, index, contact))
-        note = "diverges" if math.isinf(error) else f"{1e3 * error:.0f} mm"
+            error = distance = math.inf
+        found.append((error, index, contact, distance))
+        note = "diverges" if math.isinf(error) else f"{1e3 * distance:.0f} mm"
         progress(f"identify: {family.kind} search", len(found), len(candidates) + extra, note)
 
     for index in range(len(candidates)):
         tried(index, contacts[0])
-    for _, index, _ in sorted(found)[:RECONSIDERED]:
+    for _, index, *_ in sorted(found)[:RECONSIDERED]:
         for contact in contacts[1:]:
             tried(index, contact)
-    error, index, contact = min(found)
+    error, index, contact, distance = min(found)
     if math.isinf(error):
         raise MasivError(
             f"identify: every starting {family.kind} law diverges; check the scene's ground, gravity and units"
         )
-    return FamilyFit(family.kind, contact, {**candidates[index], **throw}, error, rollouts=len(found))
+    return FamilyFit(family.kind, contact, {**candidates[index], **throw}, distance, rollouts=len(found))
 
 
 def fit_family(
@@ -118,32 +121,38 @@ def fit_family(
     progress: Progress,
     *,
     share: float = 1.0,
-    further: bool = False,
+    pictures: bool = False,
 ) -> FamilyFit:
     """``kind`` fitted on few particles. Goes on from, and saves after each stage to, ``checkpoint`` under its name.
 
-    share: of the rollouts that the configuration allows a stage. further: fit all frames once more from where that
-    ended, to the pictures, too, where there are some. Raises MasivError where every start diverges.
+    share: of the rollouts that the configuration allows a stage. pictures: fit these, too, see ``Misfit``. Raises
+    MasivError where every start diverges.
     """
     family = FAMILIES[kind].scaled(few.scene.density)
     saved = (checkpoint.load() or {}).get(kind)
     if saved is None:
-        found = search(few, family, motion, progress)
-        _keep(checkpoint, found)
+        found = search(few, family, motion, progress, pictures=pictures)
+        keep(checkpoint, found)
     else:
         found = FamilyFit(**saved)
     middle = min(few.frames, max(first_frames, (few.frames + 1) // 2))
     budget = max(2, round(share * few.config.family_rollouts))
-    for stage, frames in ((1, middle), (2, few.frames), (3, few.frames if further else 0)):
-        if found.stage >= stage or frames == 0:
-            continue
-        label = f"identify: {kind} fit, {frames} frames"
-        found = _stage(few, family, found, frames, stage, budget, label, progress)
-        _keep(checkpoint, found)
+    for stage, frames in ((1, middle), (2, few.frames)):
+        if found.stage < stage:
+            found = _stage(few, family, found, frames, stage, budget, progress, pictures)
+            keep(checkpoint, found)
     return found
 
 
-def _keep(checkpoint: Checkpoint, found: FamilyFit, name: str | None = None) -> None:
+def fit_further(found: FamilyFit, few: Problem, progress: Progress, *, pictures: bool = False) -> FamilyFit:
+    """``found``, whose fit was shortened, fitted to all frames once more from where it ended."""
+    if found.stage >= FURTHER:
+        return found
+    family = FAMILIES[found.kind].scaled(few.scene.density)
+    return _stage(few, family, found, few.frames, FURTHER, few.config.family_rollouts, progress, pictures)
+
+
+def keep(checkpoint: Checkpoint, found: FamilyFit, name: str | None = None) -> None:
     checkpoint.save({**(checkpoint.load() or {}), name or found.kind: found.state()})
 
 
@@ -154,11 +163,12 @@ def _stage(
     frames: int,
     stage: int,
     budget: int,
-    label: str,
     progress: Progress,
+    pictures: bool,
 ) -> FamilyFit:
     """Gauss-Newton over ``frames`` from what was found."""
-    misfit = Misfit(problem, family, found.contact, frames, pictures=_with_pictures(problem, stage))
+    label = f"identify: {found.kind} fit, {frames} frames"
+    misfit = Misfit(problem, family, found.contact, frames, pictures=pictures)
     done = 0
 
     def residual(values: dict[str, float]) -> np.ndarray:
@@ -177,11 +187,6 @@ def _stage(
     return found
 
 
-def _with_pictures(problem: Problem, stage: int) -> bool:
-    """Whether a fit at ``stage`` has pictures beside the paths."""
-    return stage >= WITH_PICTURES and compared(problem)
-
-
 def _of_paths(estimate: Estimate, misfit: Misfit) -> Estimate:
     """What ``estimate`` says of paths, in metres, by which standard errors and information criteria are worked out:
     neighbouring pixels are hardly independent."""
@@ -192,8 +197,9 @@ def _of_paths(estimate: Estimate, misfit: Misfit) -> Estimate:
 
 
 def fit_all_particles(
-    found: FamilyFit, few: Problem, problem: Problem, checkpoint: Checkpoint, progress: Progress
-) -> FamilyFit:
+    found: FamilyFit, few: Problem, problem: Problem, checkpoint: Checkpoint, progress: Progress,
+    *, pictures: bool = False,
+) -> FamilyFit:  # fmt: skip
     """Chord steps: the Jacobian of few particles on the residual of the same particles in rollouts of all of them.
 
     A finer body is a little stiffer and loses less to the grid, which moves the residual more than its derivative.
@@ -206,7 +212,6 @@ def fit_all_particles(
     total = CHORD_STEPS + 2
     family = FAMILIES[found.kind].scaled(few.scene.density)
     parameters = _parameters(few, family, found)
-    pictures = _with_pictures(problem, found.stage)
     progress(label, 0, total)
     on_few = Misfit(few, family, found.contact, few.frames, pictures=pictures)
     coarse = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
@@ -237,7 +242,7 @@ def fit_all_particles(
     estimate = Estimate(values, spread, jacobian, residual, coarse.evaluations + CHORD_STEPS + 1, tuple(parameters))
     found = _updated(few, found, _of_paths(estimate, misfit), 4)
     found.error_m = mean_distance(best)
-    _keep(checkpoint, found, f"{found.kind}, {ALL}")
+    keep(checkpoint, found, f"{found.kind}, {ALL}")
     progress(label, total, total, f"{1e3 * found.error_m:.1f} mm")
     return found
 
