@@ -7,6 +7,7 @@ confusion table.
 """
 
 import argparse
+import dataclasses
 import json
 import sys
 import time
@@ -185,6 +186,7 @@ def main():
     parser.add_argument("--particles", type=int, default=1500)
     parser.add_argument("--laws", default="", help="families that compete, with commas; the case's own where empty")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of refine")
+    parser.add_argument("--per-cell", type=float, default=6.0, help="particles a cell of the truth's grid")
     parser.add_argument("--no-oracle", action="store_true", help="do not fit a model that was told the effect")
     parser.add_argument("--table")
     options = parser.parse_args()
@@ -203,6 +205,7 @@ def main():
         laws = [n for n in options.laws.split(",") if n] or [case.law]
         settings = {"particles": options.particles, "laws": laws}
         settings |= {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in options.set)}
+        case = dataclasses.replace(case, per_cell=options.per_cell)
         row = refined(case, RefineConfig.model_validate(settings), not options.no_oracle)
         with out.open("a") as file:
             file.write(json.dumps(row) + "\n")

@@ -1,6 +1,7 @@
 """Throws of simulated bodies with one undeclared effect, as tracks with correlated noise: cases for refine.
 
-The motion is simulated with more particles on a finer grid than any model of it; noise is smooth in space and time.
+The motion is simulated with more particles on a finer grid than any model of it, which with six particles a cell is the
+grid of the twin that sigma looks at, too (``per_cell`` makes it another); noise is smooth in space and time.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ class Case:
     frames: int = 16
     fit_frames: int = 12
     particles: int = 4000
+    per_cell: float = 6.0
     noise_mm: float = 2.0
     seed: int = 0
     contact: str = "sticky"
@@ -58,7 +60,7 @@ def observed(case: Case) -> tuple[Scene, SampledMotion]:
     start = torch.as_tensor(body.particles, dtype=torch.float32)
     law = ClassicalLaw(case.law, **case.parameters)
     count = len(start)
-    spacing = (6 * body.volume / count) ** (1 / 3)
+    spacing = (case.per_cell * body.volume / count) ** (1 / 3)
     steps = 8 * int(np.ceil(((2 * law.wave_modulus() / 1000) ** 0.5 + 5) / (0.3 * spacing * FPS) / 8))
     simulator = Simulator(particle_count=count, spacing=spacing, substep=1 / (FPS * steps), volume=body.volume,
                           density=1000.0, gravity=(0.0, -9.8, 0.0), contact=case.contact, max_substeps=512)  # fmt: skip
