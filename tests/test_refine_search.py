@@ -82,6 +82,31 @@ def test_what_is_simpler_or_has_a_kink_is_fitted_again_from_where_the_best_ended
     assert [t.fitted.cost for t in trials] == [1.0, 2.0, 0.5, 2.0]
 
 
+@pytest.mark.parametrize(("left", "fitted"), [(1.1, ["0", "1"]), (1.3, ["0", "1", "2", "3"])])
+def test_more_causes_are_fitted_while_much_is_left(left, fitted, monkeypatch):
+    """A cause that acts at a place may be far down in a linear ranking: of five that explain something, in twos."""
+    heard = []
+    explained = {"0": 0.5, "1": 0.4, "2": 0.3, "3": 0.2, "4": 0.15, "5": 0.05}
+    candidates = [SimpleNamespace(effect=name, explained=share) for name, share in explained.items()]
+
+    def trials(simulation, early, start, candidates, *_):
+        heard.extend(c.effect for c in candidates)
+        return [Trial(c, fit()) for c in candidates]
+
+    monkeypatch.setattr(loop, "ranked", lambda *_, **__: candidates)
+    monkeypatch.setattr(loop, "_trials", trials)
+    monkeypatch.setattr(loop, "excess", lambda *_: left)
+    monkeypatch.setattr(loop, "_second_chance", lambda *_: None)
+    monkeypatch.setattr(loop, "confusable", lambda *_: {})
+    monkeypatch.setattr(loop, "_reasons", lambda *_: ["none is meant"])
+    simulation = Library()
+    simulation.early = lambda base: []
+    base = fit(cost=2.0)
+    done = loop._round(simulation, base, [base], 1.0, RefineConfig(shortlist=2), lambda *_: None, Workers())
+    assert heard == fitted
+    assert done.accepted is None
+
+
 def test_a_cause_that_falls_short_of_its_promise_gets_fresh_derivatives(monkeypatch):
     base = SimpleNamespace(
         model=SimpleNamespace(with_effect=lambda name: name), values={}, cost=1.0, parameters=(), effects=()
