@@ -12,7 +12,7 @@ from masiv.identify.parametric import Parameter
 from masiv.refine import second_look
 from masiv.refine.add_effect import absent
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import excess, explains_too_little, foretold, sigmas_from_zero, simplest
+from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
 from masiv.refine.loop import in_reach
 from masiv.refine.model import Simulation
 from masiv.refine.noise import uncertainties
@@ -151,17 +151,6 @@ def test_evidence():
     assert "held-out" in judged(fits(1.6, 2.0), fits(1.2, 2.0), adapts=False)[-1]
     # Nothing is plain where the simulation is nowhere as certain as the observation.
     assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]
-
-
-def test_held_out_frames_alone_may_be_proof():
-    def proof(before, after, sigma=NOISE):
-        return foretold(before, after, [Watched(sigma=np.full(INSTANTS, sigma))], RefineConfig())
-
-    assert proof(fits(9, 80), fits(4, 16))
-    assert not proof(fits(9, 80), fits(4, 25))  # 44 % of the error
-    assert not proof(fits(9, 80), fits(4, 16), sigma=10 * NOISE)  # which noise and grid could be
-    nothing = [Watched(sigma=np.full(INSTANTS, NOISE), holds_out=False)]
-    assert not foretold(fits(9, 80), fits(4, 16), nothing, RefineConfig())
 
 
 def test_a_second_cause_is_confirmed_and_both_are_certain():

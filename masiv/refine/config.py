@@ -55,7 +55,11 @@ class RefineConfig(BaseModel):
         6.0, ge=0,
         description="sigmas, of a noise as smooth as what is left, from which the noise's own variance is enough there",
     )  # fmt: skip
-    least_bic: float = Field(10.0, ge=0, description="how far an effect must lower the information criterion")
+    least_bic: float = Field(
+        6.0, ge=0,
+        description="how far an effect must lower the information criterion; from 6 on evidence is called strong (Kass "
+        "and Raftery, JASA 90, 1995), and held-out frames are asked besides",
+    )  # fmt: skip
     least_sigmas: float = Field(3.0, ge=0, description="standard errors that a strength must lie from zero")
     least_apart: float = Field(
         2.0, ge=0, description="sigmas of smooth noise from which one cause is told from another that explains less"

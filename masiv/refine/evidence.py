@@ -72,7 +72,7 @@ def objections(
     """Why ``term`` is not accepted; empty where it is."""
     out = []
     gain = before.bic(after.samples) - after.bic(after.samples)
-    if gain < config.least_bic and not (gain > 0 and foretold(before, after, experiments, config)):
+    if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
     adapts = len(term.parameters) > 1 or gain < 2 * config.least_bic
     out += explains_too_little(
@@ -82,13 +82,6 @@ def objections(
     if not sigmas >= config.least_sigmas:
         out.append(f"its strength is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
     return out + beyond_possible(after, term)
-
-
-def foretold(before: Fitted, after: Fitted, experiments: Sequence[Watched], config: RefineConfig) -> bool:
-    """Whether held-out instants alone are proof: ``after`` removes ``decisive_gain`` of their error and more than noise
-    and grid could change. An information criterion that counts few independent samples may ask too much then."""
-    was, now = held_out(before, experiments), held_out(after, experiments)
-    return len(was) > 0 and (was - now).mean() >= 1 and removed_of(was, now) >= config.decisive_gain
 
 
 def beyond_possible(after: Fitted, term: Term) -> list[str]:

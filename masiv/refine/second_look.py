@@ -13,6 +13,7 @@ from collections.abc import Callable
 from masiv.refine.add_effect import refit
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import beyond_possible, held_out, removed_of, sigmas_from_zero
+from masiv.refine.naming import named
 from masiv.refine.refit import Fitted, carried
 from masiv.refine.rounds import Round, Trial, confusable
 from masiv.refine.score import Candidate
@@ -35,8 +36,8 @@ def second_look(
     say: Say,
     workers: Workers,
 ) -> list[Round]:
-    """Rounds on top of ``current``, the model with what ``first`` accepted, and of its closest rival: the best of all
-    trials is accepted in one of them, or nothing is."""
+    """Rounds on top of ``current``, the model with what ``first`` accepted, and of its closest rival. In the one that
+    has the best of all trials, if that passes, a cause is named as in any round; else nothing is."""
     here = current.model
     rivals = [
         t.fitted
@@ -50,7 +51,9 @@ def second_look(
         samples = min((t.fitted for t in trials), key=lambda f: f.cost).samples
         best = min(trials, key=lambda t: t.fitted.bic(samples))
         for done in rounds:
-            done.accepted = best if best.passes and best in done.trials else None
+            if best.passes and best in done.trials:
+                ordered = sorted(done.trials, key=lambda t: t.fitted.bic(samples))
+                done.accepted, done.or_else = named(ordered, simulation.experiments, config)
     return rounds
 
 
