@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_refine import VELOCITY
+from test_workers import small_simulation
 
 from masiv.identify.parametric import Parameter
 from masiv.refine import second_look
@@ -171,12 +173,12 @@ def test_a_second_cause_is_confirmed_and_both_are_certain():
         config = RefineConfig.model_validate({})
         return " ".join(second_look.objections(simulation, pair(0.0, was), pair(gain, now, **more), config))
 
-    assert objected(15, 4.0, 1.8) == ""  # held-out frames confirm it
-    assert "asked: 30 %" in objected(15, 4.0, 2.5)
+    assert objected(9, 4.0, 1.8) == ""  # held-out frames confirm it
+    assert "asked: 30 %" in objected(9, 4.0, 2.5)
     assert objected(25, 4.0, 2.5) == ""  # less will do where the criterion is clear
     assert "asked: 15 %" in objected(99, 2.0, 2.0)
     assert "-22 % of the held-out" in objected(99, 2.0, 3.0)
-    assert "less than 10" in objected(5, 4.0, 2.0)
+    assert "less than 6" in objected(5, 4.0, 2.0)
     assert "2.0 standard errors" in objected(25, 4.0, 2.0, sigmas=2.0)
 
 
@@ -222,6 +224,7 @@ def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
     class Throw:
         problem: SimpleNamespace
         fitted: int = 12
+        flight: int = 3
 
         @property
         def rows(self):
@@ -232,6 +235,19 @@ def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
     assert simulation.early(SimpleNamespace(squares=[near])) == []
     away = np.where(np.arange(30) < 12, near, 0.2**2)  # at the end of frame 6, all is well
     assert [s.experiments[0].fitted for s in simulation.early(SimpleNamespace(squares=[away]))] == [9, 10]
+    # A fit that gives up the flight for what comes after it shows at once, which is no sign of when that was.
+    everywhere = np.full(30, 0.2**2)
+    for flight, horizons in ((3, [6, 9]), (6, [9, 10])):
+        simulation = Simulation([replace(simulation.experiments[0], flight=flight)])
+        assert [s.experiments[0].fitted for s in simulation.early(SimpleNamespace(squares=[everywhere]))] == horizons
+
+
+@pytest.mark.usefixtures("taichi")
+def test_first_moments_begin_with_the_throw_of_free_flight():
+    simulation, _ = small_simulation()
+    begun = simulation.begun({"youngs_modulus": 1e4, "velocity_x@run": 9.0, "linear_drag.rate": 0.5})
+    assert begun.pop("velocity_x@run") == pytest.approx(VELOCITY[0], abs=0.1)
+    assert begun == {"youngs_modulus": 1e4, "linear_drag.rate": 0.5}
 
 
 def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():

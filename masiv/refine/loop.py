@@ -150,7 +150,9 @@ def _round(
         names = [c.effect for c in ranking if c.explained >= config.least_explained][: config.shortlist]
         if ranking and not names:
             break
-        early, start = _first_moments(simulation, base, soft)
+        early, start = simulation.early(base), base
+        if early:  # what comes late in such a motion pulls a fit of all of it away from the flight, too
+            start = carried(early[0], replace(base, values=simulation.begun(base.values)), soft)
         candidates = ranked(
             workers, early[0] if early else simulation, start, soft=soft,
             names=names or config.effects or simulation.candidates(base.model),
@@ -186,25 +188,6 @@ def _round(
         trial.reasons = _reasons(simulation, current, trial, config)
         accepted = trial if trial.passes else None
     return Round(current, ranking, trials, accepted, alike, or_else if accepted else [])
-
-
-def _first_moments(simulation: Simulated, base: Fitted, soft: float) -> tuple[Sequence[Simulated], Fitted]:
-    """``Simulated.early``, and ``base`` fitted to the first of them; ``base`` itself where there are none.
-
-    What comes late in a motion that ends somewhere else pulls a fit of all of it away from the flight, too. A fit of
-    the first moments alone says how long the motion is as it should be."""
-    early = simulation.early(base)
-    if not early:
-        return early, base
-    start = carried(early[0], base, soft)
-    longer = simulation.early(start)
-    if longer and _rows(longer[0]) > _rows(early[0]):
-        return longer, carried(longer[0], start, soft)
-    return early, start
-
-
-def _rows(simulation: Simulated) -> int:
-    return sum(e.rows for e in simulation.experiments)
 
 
 def _trials(

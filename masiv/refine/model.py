@@ -29,7 +29,8 @@ LOST, SHOWS = 0.25, 0.05
 class Experiment(Weighing):
     """One throw: rollouts of the body against its observed motion, of which frames 1…fitted-1 may be fitted.
 
-    motion: of ``problem``'s start, simulation frame. finer: the same on finer grids with all particles, of which those
+    motion: of ``problem``'s start, simulation frame, as ``flight``, its last frame of free flight, and those before
+    have it. finer: the same on finer grids with all particles, of which those
     of ``problem`` are some. noise: of the observation [m]. sigma (K,): by how much model and observation may differ at
     each instant [m] with nothing missing; the noise while the rest is not known.
     """
@@ -38,6 +39,7 @@ class Experiment(Weighing):
     problem: Problem
     fitted: int
     motion: Motion
+    flight: int
     finer: tuple[Problem, ...]
     noise: float
     sigma: np.ndarray
@@ -148,14 +150,22 @@ class Simulation:
             term, stands_for=() if instead is None else tuple(f"{instead}@{e.name}" for e in self.experiments)
         )
 
+    def begun(self, values: Mapping[str, float]) -> dict[str, float]:
+        """``values`` with each throw as it was found in free flight."""
+        throws = {
+            f"{p.name}@{e.name}": p.start for e in self.experiments for p in motion_parameters(e.problem, e.motion)
+        }
+        return {name: throws.get(name, value) for name, value in values.items()}
+
     def early(self, base: Fitted) -> list[Simulation]:
-        """The frames until the residual shows, then half of the rest, where a body ends somewhere else altogether."""
+        """The frames until the residual shows, free flight at the least, then half of the rest, where a body ends
+        somewhere else altogether."""
         horizons = []
         for e, squares in zip(self.experiments, base.squares, strict=True):
             away = np.sqrt(squares[: e.rows]) / e.problem.size
             if away[-1] < LOST:
                 return []
-            shows = int(np.argmax(away > SHOWS)) // e.problem.samples + 2
+            shows = max(int(np.argmax(away > SHOWS)) // e.problem.samples, e.flight) + 2
             horizons.append((min(shows + 1, e.fitted), (shows + 1 + e.fitted) // 2))
         return [
             Simulation([replace(e, fitted=h[k]) for e, h in zip(self.experiments, horizons, strict=True)], self.steps)

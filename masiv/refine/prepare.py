@@ -55,7 +55,12 @@ def experiment_of(
     seen = torch.cat([problem.start[None], problem.targets]).double().numpy()
     lost = config.tracking_error * beyond_rigid(seen) if scene.cameras else np.zeros(len(problem.targets))
     sigma = np.hypot(noise, np.maximum.accumulate(lost))
-    return Experiment(name, problem, len(fitted.times), motion, finer, noise, sigma), few, fewer, launch
+    return (
+        Experiment(name, problem, len(fitted.times), motion, launch.last_frame, finer, noise, sigma),
+        few,
+        fewer,
+        launch,
+    )
 
 
 def thinned(simulator: SimulatorConfig, share: float) -> SimulatorConfig:

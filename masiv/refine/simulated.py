@@ -155,6 +155,10 @@ class Simulated(Protocol):
         or it tells nothing. All experiments have as many."""
         ...
 
+    def begun(self, values: Mapping[str, float]) -> dict[str, float]:
+        """``values`` with the start of each experiment as its first moments alone have it, where those are known."""
+        ...
+
     def early(self, base: Fitted) -> Sequence[Simulated]:
         """Shorter simulations through which refits go first, where ``base`` is so far off in the whole one that its
         derivatives point nowhere; none otherwise."""

@@ -307,6 +307,10 @@ class PointSimulation:
                 own.setdefault(run.body, []).append(field)
         return {body: rms_mm(found) for body, found in own.items()}
 
+    def begun(self, values: Mapping[str, float]) -> dict[str, float]:
+        """As they are: no start is known but from a fit."""
+        return dict(values)
+
     def early(self, base: Fitted) -> Sequence[PointSimulation]:
         """None: a flight has no phase to lose."""
         return ()

@@ -333,6 +333,10 @@ class BodySimulation:
         """None: over many periods two grids are out of phase, which would hide all else. See benchmarks/measured.md."""
         return []
 
+    def begun(self, values: Mapping[str, float]) -> dict[str, float]:
+        """As they are: no start is known but from a fit."""
+        return dict(values)
+
     def early(self, base: Fitted) -> Sequence[BodySimulation]:
         """The first moments, then ever more, where the phase is lost. None where they are left out: an effective start
         makes up for nearly any motion that is short."""
