@@ -30,7 +30,8 @@ COMPETITORS = {
     "jelly": ("neo_hookean", "von_mises"),
     "plasticine": ("von_mises", "neo_hookean", "non_newtonian"),
     "water": ("newtonian", "non_newtonian"),
-    "honey": ("newtonian", "non_newtonian"),
+    # A Maxwell fluid that relaxes slower than the motion lasts is a solid.
+    "honey": ("newtonian", "non_newtonian", "von_mises", "neo_hookean"),
     "sand": ("drucker_prager", "von_mises"),
 }
 """Classical laws that are worth a try, by the law whose rollout was nearest to the motion in identify."""
