@@ -173,8 +173,8 @@ def test_a_second_cause_is_confirmed_and_both_are_certain():
         config = RefineConfig.model_validate({})
         return " ".join(second_look.objections(simulation, pair(0.0, was), pair(gain, now, **more), config))
 
-    assert objected(9, 4.0, 1.8) == ""  # held-out frames confirm it
-    assert "asked: 30 %" in objected(9, 4.0, 2.5)
+    assert objected(15, 4.0, 1.8) == ""  # held-out frames confirm it
+    assert "asked: 30 %" in objected(15, 4.0, 2.5)
     assert objected(25, 4.0, 2.5) == ""  # less will do where the criterion is clear
     assert "asked: 15 %" in objected(99, 2.0, 2.0)
     assert "-22 % of the held-out" in objected(99, 2.0, 3.0)

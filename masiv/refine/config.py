@@ -60,6 +60,11 @@ class RefineConfig(BaseModel):
         description="how far an effect must lower the information criterion; from 6 on evidence is called strong (Kass "
         "and Raftery, JASA 90, 1995), and held-out frames are asked besides",
     )  # fmt: skip
+    clear_bic: float = Field(
+        20.0, ge=0,
+        description="from where the criterion is so clear that held-out frames need to confirm less: of an effect that "
+        "is one number, and of a second one",
+    )  # fmt: skip
     least_sigmas: float = Field(3.0, ge=0, description="standard errors that a strength must lie from zero")
     least_apart: float = Field(
         2.0, ge=0, description="sigmas of smooth noise from which one cause is told from another that explains less"

@@ -74,7 +74,7 @@ def objections(
     gain = before.bic(after.samples) - after.bic(after.samples)
     if gain < config.least_bic:
         out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
-    adapts = len(term.parameters) > 1 or gain < 2 * config.least_bic
+    adapts = len(term.parameters) > 1 or gain < config.clear_bic
     out += explains_too_little(
         before, after, experiments, config, adapts=adapts, sure=lambda: certainty(after, term, experiments)
     )  # fmt: skip

@@ -106,12 +106,12 @@ def objections(simulation: Simulated, before: Fitted, after: Fitted, config: Ref
         out += beyond_possible(after, term)
         out += simulation.objections(before, after, term, config)
     was, now = (held_out(f, simulation.experiments) for f in (before, after))
-    clear = gain >= 2 * config.least_bic
+    clear = gain >= config.clear_bic
     if len(was):
         removed = removed_of(was, now)
         asked = config.least_gain * (1 if clear else 2)
         if removed < asked:
             out.append(f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * asked:.0f} %)")
     elif not clear:
-        out.append(f"the information criterion falls by {gain:.1f}, less than {2 * config.least_bic:g}")
+        out.append(f"the information criterion falls by {gain:.1f}, less than {config.clear_bic:g}")
     return out
