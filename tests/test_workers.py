@@ -125,7 +125,7 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
     motion = observed({})
     motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
-    problem = Problem(scene(), motion, config, SimulatorConfig(), chosen=np.arange(0, 600, 4))
+    problem = Problem(scene(), motion, config, SimulatorConfig(), chosen=np.arange(0, 512, 4))
     throw = Motion.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
     listening = Listening()
     alone, beside = (choose_start(problem, throw, quiet, workers) for workers in (listening, two))
