@@ -10,15 +10,16 @@ import pytest
 from test_refine import VELOCITY
 from test_workers import small_simulation
 
+from masiv.identify.families import FAMILIES
 from masiv.identify.parametric import Parameter
 from masiv.refine import second_look
 from masiv.refine.add_effect import absent
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
+from masiv.refine.grids import weighed
 from masiv.refine.loop import in_reach
-from masiv.refine.model import Simulation
-from masiv.refine.noise import uncertainties
-from masiv.refine.refit import best_strength, leapt, strengths_alone
+from masiv.refine.model import Model, Simulation
+from masiv.refine.refit import best_strength, column, leapt, strengths_alone
 from masiv.refine.score import score
 from masiv.refine.simulated import Term
 
@@ -33,6 +34,7 @@ class Watched:
     instants: int = INSTANTS
     rows: int = ROWS
     holds_out: bool = True
+    grid_change: np.ndarray | None = None
 
 
 class Linear:
@@ -99,25 +101,38 @@ def test_an_effect_begins_with_what_stood_for_it():
     assert absent(plain, {"velocity_x@a": 1.0}) == {"linear_drag.rate": 0.0, "velocity_x@a": 1.0}
 
 
-def test_what_a_fit_absorbs_is_no_uncertainty():
+def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
     random = np.random.default_rng(2)
     jacobian = random.normal(size=(ROWS * POINTS * 3, 2))
-    absorbed = np.zeros((INSTANTS, POINTS, 3))
+    shape = (INSTANTS, POINTS, 3)
+    absorbed = np.zeros(shape)
     absorbed[:ROWS] = 1e-2 * (jacobian @ np.array([1.0, -2.0])).reshape(ROWS, POINTS, 3)
-    fitted = SimpleNamespace(jacobian=jacobian, model=None, values={})
     sizes = np.sqrt((absorbed[:ROWS] ** 2).sum(2).mean(1))
     assert (sizes > 10 * NOISE).all()
-    (sigma,) = uncertainties(Linear(jacobian, 0.0, absorbed), fitted, [np.full(INSTANTS, NOISE)])
-    np.testing.assert_allclose(sigma, NOISE, rtol=1e-6)
-    other = 1e-2 * random.normal(size=absorbed.shape)
-    (sigma,) = uncertainties(Linear(jacobian, 0.0, other), fitted, [np.full(INSTANTS, NOISE)])
-    rms = np.sqrt((other**2).sum(2).mean(1))
-    assert (sigma[:ROWS] >= 0.8 * rms[:ROWS]).all()
-    assert (np.diff(sigma) >= 0).all()
-    (both,) = uncertainties(Linear(jacobian, 0.0, other, absorbed), fitted, [np.full(INSTANTS, NOISE)])
-    np.testing.assert_allclose(both**2 - NOISE**2, (sigma**2 - NOISE**2) / 2, rtol=1e-3)  # one grid in two changes it
-    (sigma,) = uncertainties(Linear(jacobian, 0.0), fitted, [np.full(INSTANTS, NOISE)])
-    np.testing.assert_array_equal(sigma, NOISE)
+    fitted = SimpleNamespace(jacobian=jacobian, model=None, values={}, parameters=parameters())
+
+    def found(*changes, fitted=fitted):
+        (experiment,) = weighed(Linear(jacobian, 0.0, *changes), fitted, [np.full(INSTANTS, NOISE)])
+        return experiment
+
+    np.testing.assert_allclose(found(absorbed, 2 * absorbed).sigma, NOISE, rtol=1e-6)
+    common, apart = 3e-2 * random.normal(size=shape), 1e-2 * random.normal(size=shape)
+    alike = found(common, 1.2 * common + absorbed)
+    np.testing.assert_allclose(alike.sigma, NOISE, rtol=1e-6)
+    np.testing.assert_allclose(alike.grid_change, 1.1 * common + absorbed / 2)
+    differing = found(common + apart, common - apart)
+    rms = np.sqrt((apart**2).sum(2).mean(1))
+    # A third grid is off the mean of two by the square root of three times as much as they are.
+    assert (np.sqrt(differing.sigma**2 - NOISE**2)[:ROWS] >= 0.8 * np.sqrt(3) * rms[:ROWS]).all()
+    assert (differing.sigma <= 3 * np.maximum.accumulate(rms) + NOISE).all()
+    assert (np.diff(differing.sigma) >= 0).all()
+    # What an earlier mean had absorbed does not count.
+    columns = np.concatenate([apart[:ROWS].reshape(-1, 1), jacobian], axis=1)
+    share = Parameter("grid_change@0", 0.0, -1.0, 3.0, 0.25)
+    again = SimpleNamespace(jacobian=columns, model=None, values={}, parameters=[share, *parameters()])
+    np.testing.assert_array_equal(found(common + apart, common - apart, fitted=again).sigma, differing.sigma)
+    assert found().grid_change is None
+    np.testing.assert_array_equal(found().sigma, NOISE)
 
 
 def fits(*levels, count=3):
@@ -248,6 +263,26 @@ def test_first_moments_begin_with_the_throw_of_free_flight():
     begun = simulation.begun({"youngs_modulus": 1e4, "velocity_x@run": 9.0, "linear_drag.rate": 0.5})
     assert begun.pop("velocity_x@run") == pytest.approx(VELOCITY[0], abs=0.3)  # drag acts, too
     assert begun == {"youngs_modulus": 1e4, "linear_drag.rate": 0.5}
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_model_has_a_share_of_what_finer_grids_change():
+    simulation, _ = small_simulation()
+    model = Model(FAMILIES["neo_hookean"], "sticky")
+    values = {p.name: p.start for p in simulation.parameters(model)}
+    (without,) = simulation.fields(model, values)
+    change = np.random.default_rng(0).normal(size=(simulation.experiments[0].instants, *without.shape[1:]))
+    simulation.experiments = (replace(simulation.experiments[0], grid_change=change),)
+    share = simulation.parameters(model)[0]
+    assert (share.name, share.start) == ("grid_change@run", 0.0)
+    rolled = simulation.rollouts
+    residual = simulation.residual(model, values)
+    derivative = column(simulation, model, {**values, share.name: 0.0}, residual, share)
+    assert simulation.rollouts == rolled  # nothing else moves
+    expected = simulation.experiments[0].weighted(change[: len(without)]).ravel()
+    np.testing.assert_allclose(derivative, expected, rtol=1e-9, atol=1e-12)
+    (whole,) = simulation.fields(model, {**values, share.name: 0.5}, held_out=True)
+    np.testing.assert_array_equal(whole[: len(without)], without + 0.5 * change[: len(without)])
 
 
 def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():

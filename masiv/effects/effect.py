@@ -91,8 +91,9 @@ class Effect(ABC):
         """Why values of ``shared`` (P,) cannot be, given what is known of the body and the medium."""
         return None
 
-    def unseen(self, theta: torch.Tensor, watched: float) -> str | None:
-        """Why parameters (P,) do not deserve the effect's name after ``watched`` seconds of motion, or None."""
+    def unseen(self, theta: torch.Tensor, watched: float, places: torch.Tensor) -> str | None:
+        """Why parameters (P,) do not deserve the effect's name after ``watched`` seconds of motion in which points of
+        the body came through ``places`` (M, 3) [m], or None."""
         return None
 
     def node_velocity(self) -> Callable[..., Any]:

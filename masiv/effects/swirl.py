@@ -1,8 +1,12 @@
 """A force round a vertical axis."""
 
 import taichi as ti
+import torch
 
 from masiv.effects.effect import Effect, EffectParameter
+
+UNIFORM = 0.9
+"""Share of a swirl's mean square, over where the body was, from which it is no more than a uniform force."""
 
 
 @ti.func
@@ -24,6 +28,14 @@ class Swirl(Effect):
 
     def node_velocity(self):
         return _swirled
+
+    def unseen(self, theta, watched, places):
+        """About an axis that is far from where the body was, it pushes all of it the same way."""
+        arms = places[:, ::2].double() - theta[1:].double()
+        middle = arms.mean(0)
+        if float(middle.square().sum()) < UNIFORM * float(arms.square().sum(1).mean()):
+            return None
+        return f"its axis is {float(torch.linalg.vector_norm(middle)):.2g} m away, where it is but a uniform force"
 
     def guesses(self, setting):
         """Through the body, and a body's size away from it on four sides."""

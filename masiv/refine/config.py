@@ -26,7 +26,11 @@ class RefineConfig(BaseModel):
     baseline_rollouts: int = Field(45, ge=2, description="rollouts of each stage of a law's fit without effects")
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
-    above_noise: float = Field(1.2, ge=0, description="residual over the noise below which nothing is looked for")
+    above_noise: float = Field(
+        1.2, ge=0,
+        description="residual over the noise below which nothing is looked for, if held-out frames are foretold to "
+        "``unexplained`` times what noise and grid explain",
+    )  # fmt: skip
     tracking_error: float = Field(
         0.4, ge=0, le=1,
         description="how far points that are followed in pictures are off, over how far they left a rigid motion",

@@ -50,9 +50,12 @@ def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:
 
 
 def above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineConfig) -> bool:
-    """Whether the residual over the fitted instants is above the noise of the observation."""
+    """Whether the residual over the fitted instants is above the noise of the observation, or that over the held-out
+    ones above what noise and grid explain: what a law and a throw make up for at first shows there."""
     squares = np.concatenate([(s / e.noise**2)[: e.rows] for s, e in zip(fitted.squares, experiments, strict=True)])
-    return math.sqrt(float(squares.mean())) > config.above_noise
+    rest = held_out(fitted, experiments)
+    foretold = not len(rest) or math.sqrt(float(rest.mean())) <= config.unexplained
+    return math.sqrt(float(squares.mean())) > config.above_noise or not foretold
 
 
 def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched]) -> Fitted | None:

@@ -12,8 +12,8 @@ from masiv.errors import MasivError
 from masiv.refine.add_effect import CHORD_STEPS, refit
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import above_noise, excess, objections
+from masiv.refine.grids import weighed
 from masiv.refine.naming import named
-from masiv.refine.noise import uncertainties
 from masiv.refine.refit import Fitted, carried, full_fit, held_in, ordered, reweighted, softness, strengths_alone
 from masiv.refine.rounds import TELLS_APART, Round, Trial, confusable
 from masiv.refine.score import Candidate, score
@@ -127,9 +127,9 @@ def stop_gap(simulation: Simulated, current: Fitted, soft: float, config: Refine
 def weigh(simulation: Simulated, fitted: Fitted, observation: Sequence[np.ndarray]) -> bool:
     """Give each experiment of ``simulation`` its sigma, as ``fitted`` moves; ``observation`` is its part of it. Whether
     any is another than it was."""
-    sigma = uncertainties(simulation, fitted, observation)
-    same = all(np.array_equal(e.sigma, s) for e, s in zip(simulation.experiments, sigma, strict=True))
-    simulation.experiments = tuple(replace(e, sigma=s) for e, s in zip(simulation.experiments, sigma, strict=True))
+    was = [e.sigma for e in simulation.experiments]
+    simulation.experiments = weighed(simulation, fitted, observation)
+    same = all(np.array_equal(e.sigma, s) for e, s in zip(simulation.experiments, was, strict=True))
     return not same
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from masiv.refine.refit import Fitted
 
 
+GRID_CHANGE = "grid_change"
+"""Parameter ``grid_change@experiment``: how much there is of what finer grids change."""
 LOST, SHOWS = 0.25, 0.05
 """Distance, over the size of the body, from which derivatives at the end say nothing, and from which it is plain."""
 
@@ -32,7 +34,8 @@ class Experiment(Weighing):
     motion: of ``problem``'s start, simulation frame, as ``flight``, its last frame of free flight, and those before
     have it. finer: the same on finer grids with all particles, of which those
     of ``problem`` are some. noise: of the observation [m]. sigma (K,): by how much model and observation may differ at
-    each instant [m] with nothing missing; the noise while the rest is not known.
+    each instant [m] with nothing missing; the noise while the rest is not known. grid_change (K, N, 3) [m]: what finer
+    grids change on average, of which a model may have a share; None while that is not known.
     """
 
     name: str
@@ -43,6 +46,7 @@ class Experiment(Weighing):
     finer: tuple[Problem, ...]
     noise: float
     sigma: np.ndarray
+    grid_change: np.ndarray | None = None
 
     @property
     def rows(self) -> int:
@@ -77,7 +81,8 @@ class Model:
 
 
 def parameters(model: Model, experiments: Sequence[Experiment]) -> tuple[Parameter, ...]:
-    """What is fitted: law and effects, shared by all experiments, and each one's throw, named ``name@experiment``."""
+    """What is fitted: law and effects, shared by all experiments, and each one's throw and share of what finer grids
+    change, named ``name@experiment``."""
     gone = {effect_named(name).stands_for for name in model.effects}
     own = [
         replace(p, name=f"{p.name}@{e.name}")
@@ -85,7 +90,11 @@ def parameters(model: Model, experiments: Sequence[Experiment]) -> tuple[Paramet
         for p in motion_parameters(e.problem, e.motion)
         if p.name not in gone
     ]
-    return (*model.family.parameters, *own, *(p for name in model.effects for p in effect_parameters(name)))
+    grids = [
+        Parameter(f"{GRID_CHANGE}@{e.name}", 0.0, -1.0, 3.0, 0.25) for e in experiments if e.grid_change is not None
+    ]
+    # Grids first: their derivatives need no other rollout than the one before.
+    return (*grids, *model.family.parameters, *own, *(p for name in model.effects for p in effect_parameters(name)))
 
 
 def throw_of(values: Mapping[str, float], experiment: Experiment) -> Motion:
@@ -105,6 +114,13 @@ def active(model: Model, values: Mapping[str, float], problem: Problem) -> Activ
     return ActiveEffects(members, problem.setting())
 
 
+def _path(experiment: Experiment) -> torch.Tensor:
+    """Where the particles were seen in the frames that may be fitted (T, N, 3) [m, simulation frame]."""
+    path = experiment.problem.setting().path
+    assert path is not None
+    return path[: experiment.fitted]
+
+
 def _run(
     problem: Problem, experiment: Experiment, model: Model, values: Mapping[str, float], frames: int, steps: int | None
 ) -> torch.Tensor:
@@ -121,6 +137,7 @@ class Simulation:
         self.experiments = tuple(experiments)
         self.steps = {} if steps is None else steps
         self.rollouts = 0
+        self.last: dict[int, tuple[tuple, torch.Tensor]] = {}
 
     def settle(self, model: Model, values: Mapping[str, float]) -> None:
         """Hold the substeps of the model's family at what its law with ``values`` needs, if they are not held yet."""
@@ -142,9 +159,7 @@ class Simulation:
     def term(self, name: str) -> Term:
         """The effect, of all that is filmed; its guesses are of what may be fitted of the first experiment."""
         first = self.experiments[0]
-        setting = first.problem.setting()
-        assert setting.path is not None
-        term = plain_term(name, replace(setting, path=setting.path[: first.fitted]))
+        term = plain_term(name, replace(first.problem.setting(), path=_path(first)))
         instead = effect_named(name).stands_for
         return replace(
             term, stands_for=() if instead is None else tuple(f"{instead}@{e.name}" for e in self.experiments)
@@ -178,15 +193,24 @@ class Simulation:
 
     def objections(self, before, after, term, config) -> list[str]:
         """Where the motion was not watched for long enough to give ``term`` its name."""
-        effect = effect_named(term.effect)
         theta = torch.tensor([after.values[p.name] for p in term.parameters])
         watched = max((e.fitted - 1) / e.problem.scene.fps for e in self.experiments)
-        reason = effect.unseen(theta, watched)
+        places = torch.cat([_path(e).reshape(-1, 3) for e in self.experiments])
+        reason = effect_named(term.effect).unseen(theta, watched, places)
         return [] if reason is None else [reason]
 
     @torch.no_grad()
     def positions(self, model: Model, values: Mapping[str, float], index: int, frames: int) -> torch.Tensor:
-        """Positions (frames * samples, N, 3) [m, simulation frame] of experiment ``index``. Raises NonFiniteError."""
+        """Positions (frames * samples, N, 3) [m, simulation frame] of experiment ``index``, remembered until others are
+        asked for. Raises NonFiniteError."""
+        wanted = model, {n: v for n, v in values.items() if not n.startswith(GRID_CHANGE)}, frames
+        if index in self.last and self.last[index][0] == wanted:
+            return self.last[index][1]
+        found = self._rollout(model, values, index, frames)
+        self.last[index] = wanted, found
+        return found
+
+    def _rollout(self, model: Model, values: Mapping[str, float], index: int, frames: int) -> torch.Tensor:
         experiment = self.experiments[index]
         problem = experiment.problem
         law = law_of(model.family, dict(values))
@@ -208,7 +232,11 @@ class Simulation:
         for index, experiment in enumerate(self.experiments):
             frames = experiment.problem.frames if held_out else experiment.fitted - 1
             found = self.positions(model, values, index, frames)
-            out.append((found - experiment.problem.targets[: len(found)]).double().numpy())
+            field = (found - experiment.problem.targets[: len(found)]).double().numpy()
+            if experiment.grid_change is not None:
+                share = values.get(f"{GRID_CHANGE}@{experiment.name}", 0.0)
+                field += share * experiment.grid_change[: len(found)]
+            out.append(field)
         return out
 
     def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:

@@ -222,7 +222,7 @@ def best_strength(
 def reweighted(simulation: Simulated, base: Fitted, steps: int, soft: float) -> Fitted:
     """``base`` fitted again to the residual as ``simulation`` weighs it now; fresh derivatives before and after."""
     params = started(simulation.parameters(base.model), base.values)
-    values = dict(base.values)
+    values = {**base.values, **{p.name: p.start for p in params}}
     residual = simulation.residual(base.model, values)
     for take in (steps, 0) if params else (0,):
         jacobian = np.zeros((len(residual), len(params)))

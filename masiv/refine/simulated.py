@@ -151,8 +151,8 @@ class Simulated(Protocol):
         ...
 
     def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
-        """What each finer grid changes, as a field over all instants of experiment ``index``; none: there is no finer,
-        or it tells nothing. All experiments have as many."""
+        """What each of two or more finer grids changes, as a field over all instants of experiment ``index``; none:
+        there is no finer, or it tells nothing. All experiments have as many."""
         ...
 
     def begun(self, values: Mapping[str, float]) -> dict[str, float]:

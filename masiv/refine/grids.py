@@ -1,0 +1,94 @@
+"""What other grids would change: how much there is of it is fitted, and what differs from grid to grid is uncertain.
+
+A rollout of few particles on a coarse grid differs from those on finer ones mostly in one way, that of a body which
+bounces a little more or a little less than it should. So their mean change, worked out once as the model moves, is
+added to the model in a share that is fitted (deferred correction, with a free factor), as a throw is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from masiv.refine.model import GRID_CHANGE
+from masiv.refine.refit import Fitted
+from masiv.refine.simulated import Simulated
+
+
+def weighed(simulation: Simulated, fitted: Fitted, observation: Sequence[np.ndarray]) -> tuple[Any, ...]:
+    """The experiments of ``simulation`` with what finer grids change, as ``fitted`` moves, and with sigma (K,): the
+    root mean square distance by which model and observation may differ at each instant with nothing missing. That is
+    the error of the ``observation`` (K,), and by how much one more grid may differ from the others in what no fit
+    absorbs; in free flight that is nothing.
+
+    Sigma is not less than before as time goes on, since errors of the simulation grow. Raises NonFiniteError.
+    """
+    experiments = simulation.experiments
+    found = [simulation.finer_grids(fitted.model, fitted.values, k) for k in range(len(experiments))]
+    if not all(found):
+        return tuple(replace(e, sigma=seen) for e, seen in zip(experiments, observation, strict=True))
+    mean = [np.mean(changes, axis=0) for changes in found]
+    kept = [_not_absorbed(simulation, fitted, observation, each, mean) for each in zip(*found, strict=True)]
+    # One more draw differs from the mean of these by more than they do.
+    more = math.sqrt((len(kept) + 1) / (len(kept) - 1))
+    out = []
+    for k, (e, seen) in enumerate(zip(experiments, observation, strict=True)):
+        whole = np.sqrt(np.mean([_size(change) ** 2 for change in found[k]], axis=0))
+        grid = np.minimum(more * np.sqrt(np.mean([each[k] ** 2 for each in kept], axis=0)), whole)
+        out.append(replace(e, sigma=np.hypot(seen, np.maximum.accumulate(grid)), grid_change=mean[k]))
+    return tuple(out)
+
+
+def _size(field: np.ndarray) -> np.ndarray:
+    """Root mean square length (K,) of a field (K, N, A)."""
+    return np.sqrt((field**2).sum(2).mean(1))
+
+
+def _not_absorbed(
+    simulation: Simulated,
+    fitted: Fitted,
+    observation: Sequence[np.ndarray],
+    changes: Sequence[np.ndarray],
+    mean: Sequence[np.ndarray],
+) -> list[np.ndarray]:
+    """For each experiment, the root mean square (K,) [m] of what one grid ``changes`` (K, N, A) and no fit absorbs.
+
+    A fit absorbs the change's part along the derivatives of ``fitted`` and along the ``mean`` change (K, N, A) of all
+    grids. After the fitted instants, of what is not along that mean the same share as at their end is taken to be
+    absorbed.
+    """
+    experiments = simulation.experiments
+    weights = [
+        e.noise / np.hypot(seen, np.maximum.accumulate(_size(change)))
+        for change, seen, e in zip(changes, observation, experiments, strict=True)
+    ]
+
+    def flat(fields: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [(f * w[:, None, None])[: e.rows].ravel() for f, w, e in zip(fields, weights, experiments, strict=True)]
+
+    parts = flat(changes)
+    ends = np.cumsum([len(part) for part in parts])
+    shares = np.zeros((ends[-1], len(parts)))
+    for k, part in enumerate(flat(mean)):
+        shares[ends[k] - len(part) : ends[k], k] = part
+    # The derivatives are weighted by the sigma so far.
+    again = [
+        np.broadcast_to((e.sigma / e.noise)[:, None, None], c.shape) for c, e in zip(changes, experiments, strict=True)
+    ]
+    own = [k for k, p in enumerate(fitted.parameters) if not p.name.startswith(GRID_CHANGE)]
+    columns = np.concatenate([shares, fitted.jacobian[:, own] * np.concatenate(flat(again))[:, None]], axis=1)
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    change = np.concatenate(parts)
+    absorbed = np.linalg.lstsq(columns / scale, change, rcond=1e-8)[0] / scale
+    left = np.split(change - columns @ absorbed, ends[:-1])
+    out = []
+    for k, (weight, e) in enumerate(zip(weights, experiments, strict=True)):
+        kept = _size(left[k].reshape(e.rows, *changes[k].shape[1:])) / weight[: e.rows]
+        apart = _size(changes[k] - absorbed[k] * mean[k])
+        share = min(float(kept[-1] / max(apart[e.rows - 1], 1e-300)), 1.0)
+        out.append(np.concatenate([kept, share * apart[e.rows :]]))
+    return out
