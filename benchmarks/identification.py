@@ -3,6 +3,7 @@
     python benchmarks/identification.py OUT --scenes SCENE … [--laws neural true auto …] [--seeds 0 1 …]
                                         [--geometry-loss trajectory …] [--no-silhouette] [--set KEY=VALUE …]
     python benchmarks/identification.py OUT --scenes SCENE --unseen OTHER_SCENE …      laws of SCENE on other throws
+                                        [--also SCENE …]                               learnt from these throws, too
     python benchmarks/identification.py OUT --table                                    what is there, as Markdown
 
 Law ``true`` is the family that made the scene; ``told`` is not fitted at all: that family with its true parameters and
@@ -51,7 +52,7 @@ PICTURES = ("psnr_db", "psnr_box_db", "psnr_box_in_scene_db", "ssim", "ssim_box"
 
 @dataclass(frozen=True)
 class Case:
-    """One fit. settings: configuration keys beside the preset's, as KEY=VALUE."""
+    """One fit. settings: configuration keys beside the preset's, as KEY=VALUE. also: scenes of more throws."""
 
     scene: Path
     law: str
@@ -59,6 +60,7 @@ class Case:
     geometry_loss: str
     silhouette: bool
     settings: tuple[str, ...]
+    also: tuple[Path, ...] = ()
 
     @property
     def name(self) -> str:
@@ -67,6 +69,7 @@ class Case:
             parts.append(self.geometry_loss)
         if not self.silhouette:
             parts.append("no-silhouette")
+        parts += [f"also-{scene.name}" for scene in self.also]
         return "-".join([*parts, *self.settings]).replace("/", "_")
 
 
@@ -112,10 +115,12 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
         record["stages"]["identify"] = {"state": "pending"}
         (folder / "run.yaml").write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
     family = FAMILY[truth_of(case.scene)["material"]["type"]]
+    also = [base_run(dataclasses.replace(case, scene=scene), out, preset, fit_frames) for scene in case.also]
     run, settings, scene = stages.open_run(
         case.scene, folder, preset=preset, config=overrides(case.settings, out / "config.yaml"), seed=case.seed,
         fit_frames=fit_frames, law=family if case.law in ("true", "told") else case.law,
         geometry_loss=case.geometry_loss, pictures=None if case.silhouette else 0,
+        also=[str(path.resolve()) for path in also] or None,
     )  # fmt: skip
     stages.start(settings)
     trajectory = stages.load_trajectory(run)
@@ -125,7 +130,7 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
         with run.stage("identify") as checkpoint:
             identify(
                 stages.fitted_scene(run, scene), trajectory, settings.identify, settings.simulator,
-                seed=settings.seed, checkpoint=checkpoint, progress=said,
+                others=stages.other_throws(settings), seed=settings.seed, checkpoint=checkpoint, progress=said,
             ).save(run.path)  # fmt: skip
     twin = Twin.load(run.path)
     rollout = simulate(twin, frames=scene.frame_count, fps=scene.fps).positions
@@ -165,7 +170,8 @@ def measured(
     return {
         "what": "fit", "scene": case.scene.name, "material": truth["type"], "law": case.law, "fitted": law["kind"],
         "seed": case.seed, "geometry_loss": case.geometry_loss, "silhouette": case.silhouette,
-        "settings": list(case.settings), "frames": [run.fit_frames, len(points)],
+        "settings": list(case.settings), "also": [scene.name for scene in case.also],
+        "frames": [run.fit_frames, len(points)],
         "floor": floor(points), **numbers,
         "trajectory": motion_numbers(trajectory, points, splits["observed"]), "contact": twin.contact,
         "parameters": {n: {**entry, "true": expected.get(n)} for n, entry in law["parameters"].items()},
@@ -213,6 +219,7 @@ def main() -> None:
     parser.add_argument("--no-silhouette", action="store_true")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="configuration over the preset")
     parser.add_argument("--unseen", type=Path, nargs="+", default=[], help="throws that a law of --scenes is tried on")
+    parser.add_argument("--also", type=Path, nargs="+", default=[], help="more throws that the law is learnt from")
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--fit-frames", type=int, default=12)
     parser.add_argument("--table", action="store_true", help="print the tables and do nothing else")
@@ -222,7 +229,7 @@ def main() -> None:
     done = {row["case"] for row in rows}
     chosen = [] if o.table else itertools.product(o.scenes, o.seeds, o.laws, o.geometry_loss)
     for scene, seed, law, geometry_loss in chosen:
-        case = Case(scene, law, seed, geometry_loss, not o.no_silhouette, tuple(o.set))
+        case = Case(scene, law, seed, geometry_loss, not o.no_silhouette, tuple(o.set), tuple(o.also))
         key = f"{scene.name}/{case.name}"
         if key not in done:
             began = time.monotonic()
@@ -237,7 +244,8 @@ def main() -> None:
                 found = unseen(learnt, base, other)
                 keep(results, rows, {
                     "case": key, "what": "unseen", "scene": scene.name, "law": law, "fitted": learnt.law.kind,
-                    "on": other.name, "seed": seed, "settings": list(case.settings), **found,
+                    "on": other.name, "seed": seed, "settings": list(case.settings),
+                    "also": [s.name for s in case.also], **found,
                 })  # fmt: skip
     print(tables(rows))
 

@@ -47,6 +47,7 @@ def variant(row: Mapping[str, Any]) -> list[str]:
     said = [] if row["geometry_loss"] == "trajectory" else [f"geometry: {row['geometry_loss']}"]
     said += [] if row["silhouette"] else ["no silhouette"]
     said += [f"seed {row['seed']}"] if row["seed"] else []
+    said += ["also " + ", ".join(row["also"])] if row.get("also") else []
     return said + list(row["settings"])
 
 
@@ -84,8 +85,9 @@ def unseen_table(rows: list[Mapping[str, Any]]) -> str:
     ]
     for row in rows:
         found = row["after contact"]
+        learnt = ", ".join([row["scene"], *row.get("also", [])])
         lines.append(
-            f"| {row['fitted']} | {row['scene']} | {row['on']} | {found['chamfer_1e3mm2']:.3f} ({row['floor']:.3f}) "
+            f"| {row['fitted']} | {learnt} | {row['on']} | {found['chamfer_1e3mm2']:.3f} ({row['floor']:.3f}) "
             f"| {found['tracked_error_mm']:.1f} |"
         )
     return "\n".join(lines)

@@ -31,6 +31,14 @@ def identify(
             "[default: neural]",
         ),
     ] = None,
+    also: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--also",
+            help="Run folder of another throw of the same object (masiv trajectory has made it), from which a neural "
+            "law is learnt, too. May be given several times.",
+        ),
+    ] = None,
     geometry_loss: Annotated[
         str | None,
         typer.Option(
@@ -57,6 +65,8 @@ def identify(
 
     A scene of tracks (measured points, no pictures) starts with the law: `masiv identify scenes/beam`
 
+    One law from several throws: `masiv identify scenes/egg_1 --out runs/egg_1 --also runs/egg_2 --also runs/egg_3`
+
     A classical baseline: `masiv identify scenes/bunny --out runs/bunny-elastic --law neo_hookean`
     """
     from . import stages, tracked
@@ -64,7 +74,11 @@ def identify(
 
     if tracked.is_scene(scene):
         tracked.refused(
-            fit_frames=fit_frames, holdout_camera=holdout, geometry_loss=geometry_loss, no_silhouette=no_silhouette
+            fit_frames=fit_frames,
+            holdout_camera=holdout,
+            geometry_loss=geometry_loss,
+            no_silhouette=no_silhouette,
+            also=also,
         )
         folder = out or Path("runs") / scene.resolve().name
         opened = tracked.open_run(scene, folder, preset=preset, config=config, seed=seed, arch=arch, law=law)
@@ -79,6 +93,7 @@ def identify(
         fit_frames=fit_frames,
         holdout=holdout,
         law=law,
+        also=[str(path.resolve()) for path in also] if also else None,
         geometry_loss=geometry_loss,
         pictures=0 if no_silhouette else None,
     )

@@ -38,7 +38,7 @@ def open_run(
     arch: str | None = None,
     fit_frames: int | None = None,
     holdout: list[int] | None = None,
-    **identify: str | float | None,
+    **identify: str | float | list[str] | None,
 ) -> tuple[RunFolder, Config, Scene]:
     """The run in ``out``, new or resumed, its configuration and the whole scene. What is not given is as in the run.
 
@@ -46,10 +46,15 @@ def open_run(
     Everything is checked before the folder is made. Raises InputError.
     """
     existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
-    flags: dict[str, int | float | str | None] = {"seed": seed, "arch": arch}
+    flags: dict[str, int | float | str | list[str] | None] = {"seed": seed, "arch": arch}
     flags |= {f"identify.{key}": value for key, value in identify.items()}
     settings = load_config(preset, config, existing.config if existing else None, **flags)
     scene = read_scene(scene_path)
+    for other in settings.identify.also:
+        settings.identify.refuse_more_throws()
+        if Path(other).resolve() == out.resolve():
+            raise InputError(f"--also {other} is the run itself: give those of other throws of the same object")
+        RunFolder.open(Path(other)).require("trajectory")
     if fit_frames is None:
         fit_frames = existing.fit_frames if existing else scene.fit_frames or scene.frame_count
     cameras = tuple(sorted(set(holdout))) if holdout else existing.holdout_cameras if existing else ()
@@ -109,6 +114,12 @@ def estimated(run: RunFolder, config: Config, scene: Scene, progress: Progress) 
         )
         trajectory.save(run.trajectory)
     return trajectory
+
+
+def other_throws(config: Config) -> list[tuple[Scene, Trajectory]]:
+    """The other throws from which the law is learnt, as far as their runs may be fitted."""
+    runs = [RunFolder.open(Path(path)) for path in config.identify.also]
+    return [(fitted_scene(run, read_scene(run.scene_path)), load_trajectory(run)) for run in runs]
 
 
 def held_out_trajectory(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Trajectory | None:
@@ -177,6 +188,7 @@ def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress)
             trajectory,
             config.identify,
             config.simulator,
+            others=other_throws(config),
             seed=config.seed,
             checkpoint=checkpoint,
             progress=logged(progress, run.log),

@@ -43,7 +43,7 @@ def load_config(
     preset: str | None = None,
     path: Path | None = None,
     base: Mapping[str, Any] | None = None,
-    **flags: int | float | str | None,
+    **flags: int | float | str | list[str] | None,
 ) -> Config:
     """The configuration from a preset, a YAML file and flags (None: not given); flag "identify.law" is a nested key.
 

@@ -9,6 +9,7 @@ from masiv.identify import learn
 from masiv.identify.fit import Fit
 from masiv.identify.problem import Motion, Problem
 from masiv.identify.start import Start
+from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import silent
@@ -20,12 +21,12 @@ def learnt(seen, monkeypatch, errors, objectives, pictures=None):  # noqa: F811
     fitted, laws = [], {name: NeuralLaw(seed=k) for k, name in enumerate(errors)}
     problem = Problem(scene(), seen[0], settings(polish=False), SimulatorConfig())
 
-    def fit(problem, law, motion, *_, **__):
+    def fit(throws, law, *_, **__):
         name = next(name for name, known in laws.items() if known is law)
         fitted.append(name)
         if objectives[name] is None:
             raise MasivError("identify: the fit keeps diverging")
-        return Fit(law, motion, 0.01, objectives[name])
+        return Fit(law, (throws[0].motion,), 0.01, objectives[name])
 
     starts = [Start(name, "sticky", laws[name], error) for name, error in errors.items()]
     monkeypatch.setattr(learn, "choose_start", lambda *_: starts)
@@ -35,7 +36,7 @@ def learnt(seen, monkeypatch, errors, objectives, pictures=None):  # noqa: F811
         monkeypatch.setattr(learn, "wanted", lambda _: True)
         monkeypatch.setattr(learn, "polish", lambda _, fitted, *__, **___: (fitted, by_objective[fitted.objective], {}))
     motion = Motion.of_world(problem.axes, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    found = learn.learn(problem, lambda: problem, motion, 3, 0, Checkpoint(None), silent)
+    found = learn.learn([Throw(problem, motion, 3)], lambda: problem, 0, Checkpoint(None), silent)
     return found.report["start"], fitted
 
 

@@ -16,6 +16,7 @@ from masiv.identify.objective import objective
 from masiv.identify.pictures import some_of_each
 from masiv.identify.problem import Motion, Problem
 from masiv.identify.stage import identify
+from masiv.identify.throw import Throw
 from masiv.materials.load import load_law
 from masiv.materials.pretrain import pretrained_path
 from masiv.mpm.config import SimulatorConfig
@@ -53,12 +54,13 @@ def problem_of(filmed, seen, **changes):  # noqa: F811
 
 def thrown(problem, error):
     velocity = VELOCITY + np.array([error, 0.0, 0.0])
-    return Fit(load_law(pretrained_path("jelly")), Motion.of_world(problem.axes, velocity, OMEGA))
+    return Fit(load_law(pretrained_path("jelly")), (Motion.of_world(problem.axes, velocity, OMEGA),))
 
 
 def polished(problem, fitted):
+    throw = Throw(problem, fitted.motions[0], problem.frames)
     return polish.polish(
-        problem, fitted, "sticky", fitted.law, seed=0, checkpoint=Checkpoint(None), progress=lambda *_: None
+        [throw], fitted, "sticky", fitted.law, seed=0, checkpoint=Checkpoint(None), progress=lambda *_: None
     )
 
 
@@ -73,7 +75,7 @@ def test_surfaces_correct_what_paths_had_wrong_and_silhouettes_refuse_what_they_
     wrong = thrown(problem, 0.4)
     better, nearness, first = polished(problem, wrong)
     assert first["silhouette_error_of_surfaces"] < 0.8 * first["silhouette_error_of_paths"]
-    assert abs(float(better.motion.velocity[0]) - VELOCITY[0]) < 0.2
+    assert abs(float(better.motions[0].velocity[0]) - VELOCITY[0]) < 0.2
     assert problem.config.geometry_loss == "trajectory"  # the problem of the paths is as it was
     monkeypatch.setattr(polish, "fit", lambda *_, **__: thrown(problem, 0.4))
     right = thrown(problem, 0.0)

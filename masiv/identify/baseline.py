@@ -23,6 +23,7 @@ from masiv.identify.found import Found, history_rows
 from masiv.identify.judged import nearest_first, picture_errors_of
 from masiv.identify.polish import wanted
 from masiv.identify.problem import Motion, Problem
+from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.progress import Progress, silent
 from masiv.workers import Failed, Workers, processes_wanted
@@ -75,11 +76,11 @@ def identify_classical(
     start.base.double()
     learnt_from = problem.of_surfaces(config.iterations) if pictures else problem  # paths led the classical law
     fitted = fit_weights(
-        learnt_from, start, chosen.motion, chosen.contact, problem.frames,  # the classical law was fitted to all frames
-        seed=seed, checkpoint=Beside(checkpoint), progress=progress,
+        [Throw(learnt_from, chosen.motion, problem.frames)],  # the classical law was fitted to all frames
+        start, chosen.contact, seed=seed, checkpoint=Beside(checkpoint), progress=progress,
     )  # fmt: skip
     report["classical_error_mm"] = 1e3 * chosen.error_m
-    return Found(fitted.law, fitted.motion, chosen.contact, fitted.error_m, report, history_rows(fitted))
+    return Found(fitted.law, fitted.motions[0], chosen.contact, fitted.error_m, report, history_rows(fitted))
 
 
 class Beside(Checkpoint):

@@ -6,6 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from masiv.errors import InputError
+
 
 class IdentifyConfig(BaseModel):
     """Initial velocity, ground and law. Lengths in metres; weights multiply mean errors in units of the object's
@@ -19,6 +21,9 @@ class IdentifyConfig(BaseModel):
         "neural",
         description="what is fitted: a neural law, a small correction of a classical law, a classical law's "
         "parameters, or (auto) the classical law that explains the motion best",
+    )
+    also: list[str] = Field(
+        [], description="run folders of other throws of the same object, from which a neural law is learnt, too"
     )
     adapter_base: Literal["auto", "neo_hookean", "newtonian", "non_newtonian", "von_mises", "drucker_prager"] = Field(
         "auto", description="the classical law that an adapter corrects; auto: the one that explains the motion best"
@@ -63,3 +68,8 @@ class IdentifyConfig(BaseModel):
         "over all strains: what the motion does not tell stays as it was",
     )  # fmt: skip
     pictures: int = Field(4, ge=0, description="pictures with which an iteration compares silhouette and paint")
+
+    def refuse_more_throws(self) -> None:
+        """Raises InputError where the law that is asked for is fitted to one throw."""
+        if self.law != "neural":
+            raise InputError(f"a law of kind {self.law} is fitted to one throw: leave out --also, or use --law neural")

@@ -1,11 +1,13 @@
-"""The joint fit of law, initial velocity and effective ground through the rollout."""
+"""The joint fit of law, initial velocity and effective ground through the rollouts of one throw or several."""
 
 from __future__ import annotations
 
 import copy
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from statistics import fmean as mean
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.objective import objective
 from masiv.identify.pictures import compared, picture_errors, picture_objective
 from masiv.identify.problem import Motion, Problem
+from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
@@ -26,37 +29,47 @@ RECOVERY = 1.4
 
 @dataclass
 class Fit:
-    """A law and a throw; error_m is the mean distance to the trajectories over all fitted frames; objective: what was
-    made small, there; history: (iteration, frames, trajectory error [m], silhouette error)."""
+    """A law and the motion of each throw; error_m is the mean distance to the trajectories over all fitted frames;
+    objective: what was made small, there; history: (iteration, frames, trajectory error [m], silhouette error)."""
 
     law: NeuralLaw | AdapterLaw
-    motion: Motion
+    motions: tuple[Motion, ...]
     error_m: float = math.inf
     objective: float = math.inf
     history: list[tuple[int, int, float, float]] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class _Pass:
+    """One rollout of a throw: mean distance to the trajectories [m], silhouettes' error, and the objective where the
+    rollout was over all frames."""
+
+    frames: int
+    error: float
+    outline: float
+    objective: float | None
+
+
 def fit(
-    problem: Problem,
+    throws: Sequence[Throw],
     law: NeuralLaw | AdapterLaw,
-    motion: Motion,
     contact: str,
-    first_frames: int,
     *,
     seed: int,
     checkpoint: Checkpoint,
     progress: Progress,
     prior: NeuralLaw | None = None,
 ) -> Fit:
-    """Adam on a horizon that grows from ``first_frames`` to all frames over the first half of the iterations.
+    """Adam on the mean over ``throws`` of one body, on a horizon that grows from each one's first frames to all frames
+    over the first half of the iterations.
 
     A rollout that diverges is not repaired: the step is taken back, the step sizes are halved and the horizon ends a
     frame earlier, both until steps succeed again; after several in a row the stage stops. Returns the parameters with
     the least error over all frames. prior: what a neural law is drawn to, ``law`` where None. Raises MasivError.
     """
-    config = problem.config
+    config = throws[0].problem.config
     start, law = prior or law, copy.deepcopy(law)
-    motion = Motion(*(t.detach().clone().requires_grad_() for t in motion.tensors()))
+    motions = [Motion(*(t.detach().clone().requires_grad_() for t in throw.motion.tensors())) for throw in throws]
     if isinstance(law, NeuralLaw):
         scales = law.scales()
         weights = [*law.elastic.parameters(), *law.plastic.parameters()]
@@ -65,15 +78,16 @@ def fit(
     groups = [
         (weights, config.law_learning_rate),
         (scales, config.scale_learning_rate),
-        ([motion.velocity, motion.omega], config.velocity_learning_rate),
-        ([motion.ground_offset], config.ground_learning_rate),
+        ([t for motion in motions for t in (motion.velocity, motion.omega)], config.velocity_learning_rate),
+        ([motion.ground_offset for motion in motions], config.ground_learning_rate),
     ]
     optimiser = torch.optim.Adam(
         [{"params": p, "lr": rate, "rate": rate} for p, rate in groups if p], betas=(0.9, 0.95)
     )
-    parameters = [*weights, *scales, *motion.tensors()]
-    best = Fit(copy.deepcopy(law), Motion(*(t.detach().clone() for t in motion.tensors())))
-    first, caution, failures, reach = 0, 1.0, 0, problem.frames
+    parameters = [*weights, *scales, *(t for motion in motions for t in motion.tensors())]
+    best = Fit(copy.deepcopy(law), _copied(motions))
+    longest = max(throw.problem.frames for throw in throws)
+    first, caution, failures, reach = 0, 1.0, 0, longest
     saved = checkpoint.load()
     if saved is not None and "fit" in saved:
         first, caution, failures, reach = _restore(saved["fit"], parameters, optimiser, best)
@@ -81,25 +95,24 @@ def fit(
     for i in range(first, config.iterations):
         state = functools.partial(_state, i, caution, failures, reach, parameters, optimiser, best)
         checkpoint.maybe_save(lambda state=state: {"fit": state()})
-        frames = min(reach, _horizon(i, config.iterations, first_frames, problem.frames))
         decay = 0.5 * (1 + math.cos(math.pi * i / config.iterations))
         for group in optimiser.param_groups:
             group["lr"] = group["rate"] * caution * (0.05 + 0.95 * decay)
         optimiser.zero_grad()
+        passed: list[_Pass] = []
+        frames = 0
         try:
-            positions = problem.run(law, motion, contact, frames)
-            error = problem.error(positions)
-            outline, paint = _pictures(problem, positions, frames, seed, i)
-            geometry = error if config.geometry_loss == "trajectory" else problem.geometry_error(positions)
-            loss = config.trajectory_weight * geometry / problem.size
-            loss = loss + picture_objective(problem, (outline, paint))
-            if isinstance(law, NeuralLaw) and isinstance(start, NeuralLaw) and config.prior_weight:
-                loss = loss + config.prior_weight * law.departure(start)
-            if frames == problem.frames:
-                _keep_better(best, problem, positions, law, motion)
-            loss.backward()
+            for k, (throw, motion) in enumerate(zip(throws, motions, strict=True)):
+                frames = min(reach, _horizon(i, config.iterations, throw.first_frames, throw.problem.frames))
+                departure = torch.zeros(())
+                if isinstance(law, NeuralLaw) and isinstance(start, NeuralLaw) and config.prior_weight:
+                    departure = config.prior_weight * law.departure(start)
+                passed.append(
+                    _descend(throw.problem, law, motion, contact, frames, departure, len(throws), (seed, i, k))
+                )
+            _keep_better(best, passed, law, motions)
             if not all(torch.isfinite(p.grad).all() for p in parameters if p.grad is not None):
-                raise NonFiniteError(frames * problem.substeps(law), 0, "the adjoint overflowed")
+                raise NonFiniteError(frames * throws[-1].problem.substeps(law), 0, "the adjoint overflowed")
         except NonFiniteError as diverged:
             failures, caution, reach = failures + 1, caution / 2, max(1, frames - 1)
             if failures > FAILURES_ALLOWED:
@@ -108,30 +121,63 @@ def fit(
                 for parameter, value in zip(parameters, accepted, strict=True):
                     parameter.copy_(value)
             continue
-        failures, caution, reach = 0, min(1.0, RECOVERY * caution), min(problem.frames, reach + 1)
+        failures, caution, reach = 0, min(1.0, RECOVERY * caution), min(longest, reach + 1)
         accepted = [p.detach().clone() for p in parameters]
-        best.history.append((i, frames, float(error.detach()), float(outline.detach())))
+        frames, error = max(p.frames for p in passed), mean(p.error for p in passed)
+        best.history.append((i, frames, error, mean(p.outline for p in passed)))
         for group in optimiser.param_groups:
             torch.nn.utils.clip_grad_norm_(group["params"], 1.0)
         optimiser.step()
         with torch.no_grad():
-            motion.ground_offset.clamp_(-config.ground_range, config.ground_range)
-        progress("identify: fit", i + 1, config.iterations, f"{1e3 * best.history[-1][2]:.1f} mm over {frames} frames")
+            for motion in motions:
+                motion.ground_offset.clamp_(-config.ground_range, config.ground_range)
+        progress("identify: fit", i + 1, config.iterations, f"{1e3 * error:.1f} mm over {frames} frames")
     if math.isinf(best.objective):  # no step reached the last frame
         with torch.no_grad():
             for parameter, value in zip(parameters, accepted, strict=True):
                 parameter.copy_(value)
-            _keep_better(best, problem, problem.run(law, motion, contact, problem.frames), law, motion)
+            whole = []
+            for throw, motion in zip(throws, motions, strict=True):
+                problem = throw.problem
+                positions = problem.run(law, motion, contact, problem.frames)
+                whole.append(_Pass(problem.frames, float(problem.error(positions)), 0.0, objective(problem, positions)))
+            _keep_better(best, whole, law, motions)
     return best
 
 
-def _keep_better(best: Fit, problem: Problem, positions: torch.Tensor, law: NeuralLaw | AdapterLaw, motion: Motion):
-    """Put law and throw into ``best`` where their ``positions`` over all frames are nearer to what was observed."""
-    here = objective(problem, positions)
-    if here < best.objective:
-        best.objective, best.error_m = here, float(problem.error(positions.detach()))
-        best.law = copy.deepcopy(law)
-        best.motion = Motion(*(t.detach().clone() for t in motion.tensors()))
+def _descend(
+    problem: Problem,
+    law: NeuralLaw | AdapterLaw,
+    motion: Motion,
+    contact: str,
+    frames: int,
+    departure: torch.Tensor,
+    share: float,
+    seed: tuple[int, ...],
+) -> _Pass:
+    """Add a throw's ``share`` to the gradient. departure: what the law pays for its own. Raises NonFiniteError."""
+    config = problem.config
+    positions = problem.run(law, motion, contact, frames)
+    error = problem.error(positions)
+    outline, paint = _pictures(problem, positions, frames, seed)
+    geometry = error if config.geometry_loss == "trajectory" else problem.geometry_error(positions)
+    loss = config.trajectory_weight * geometry / problem.size
+    loss = loss + picture_objective(problem, (outline, paint)) + departure
+    here = objective(problem, positions) if frames == problem.frames else None
+    (share * loss).backward()
+    return _Pass(frames, float(error.detach()), float(outline.detach()), here)
+
+
+def _copied(motions: Sequence[Motion]) -> tuple[Motion, ...]:
+    return tuple(Motion(*(t.detach().clone() for t in motion.tensors())) for motion in motions)
+
+
+def _keep_better(best: Fit, passed: Sequence[_Pass], law: NeuralLaw | AdapterLaw, motions: Sequence[Motion]) -> None:
+    """Put law and motions into ``best`` where their rollouts, all over all frames, are nearer to what was observed."""
+    objectives = [p.objective for p in passed if p.objective is not None]
+    if len(objectives) == len(passed) and mean(objectives) < best.objective:
+        best.objective, best.error_m = mean(objectives), mean(p.error for p in passed)
+        best.law, best.motions = copy.deepcopy(law), _copied(motions)
 
 
 def _horizon(iteration: int, iterations: int, first: int, last: int) -> int:
@@ -140,12 +186,12 @@ def _horizon(iteration: int, iterations: int, first: int, last: int) -> int:
 
 
 def _pictures(
-    problem: Problem, positions: torch.Tensor, frames: int, seed: int, iteration: int
+    problem: Problem, positions: torch.Tensor, frames: int, seed: tuple[int, ...]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean errors of silhouettes and paint in a few pictures drawn from (seed, iteration)."""
+    """Mean errors of silhouettes and paint in a few pictures drawn from ``seed``."""
     if not compared(problem):
         return torch.zeros(()), torch.zeros(())
-    random = np.random.default_rng((seed, iteration))
+    random = np.random.default_rng(seed)
     pictures = []
     for _ in range(problem.config.pictures):
         frame = int(random.integers(1, frames + 1))
@@ -157,7 +203,7 @@ def fit_state(found: Fit) -> dict:
     """What ``fit_from`` makes the same fit of."""
     return {
         "law": found.law.state_dict(),
-        "motion": list(found.motion.tensors()),
+        "motions": [list(motion.tensors()) for motion in found.motions],
         "error_m": found.error_m,
         "objective": found.objective,
         "history": found.history,
@@ -167,14 +213,15 @@ def fit_state(found: Fit) -> dict:
 def fit_from(state: dict, law: NeuralLaw | AdapterLaw) -> Fit:
     """The fit of ``state``; ``law``, of its kind and width, becomes its law. Raises MasivError for a state that was
     chosen by something else."""
-    if "objective" not in state:
+    if not {"objective", "motions"} <= state.keys():
         raise MasivError(
             "identify: the checkpoint is of an older masiv, whose fits were chosen otherwise: delete what is in "
             "checkpoints/ of the run folder and run the command again"
         )
     law.load_state_dict(state["law"])
     rows = [tuple(row) for row in state["history"]]
-    return Fit(law, Motion(*state["motion"]), state["error_m"], state["objective"], rows)
+    motions = tuple(Motion(*tensors) for tensors in state["motions"])
+    return Fit(law, motions, state["error_m"], state["objective"], rows)
 
 
 def _state(iteration, caution, failures, reach, parameters, optimiser, best: Fit) -> dict:
@@ -195,7 +242,7 @@ def _restore(state: dict, parameters, optimiser, best: Fit) -> tuple[int, float,
             parameter.copy_(value)
     optimiser.load_state_dict(state["optimiser"])
     kept = fit_from(state["best"], best.law)
-    best.motion, best.error_m, best.objective, best.history = (
-        kept.motion, kept.error_m, kept.objective, kept.history
+    best.motions, best.error_m, best.objective, best.history = (
+        kept.motions, kept.error_m, kept.objective, kept.history
     )  # fmt: skip
     return state["iteration"], state["caution"], state["failures"], state["reach"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +11,9 @@ from masiv.checkpoint import Checkpoint
 from masiv.identify.fit import Fit, fit, fit_from, fit_state
 from masiv.identify.found import Found, history_rows
 from masiv.identify.polish import polish, wanted
-from masiv.identify.problem import Motion, Problem
+from masiv.identify.problem import Problem
 from masiv.identify.start import Start, best_first, choose_start
+from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress, silent
 from masiv.workers import Failed, Workers, attempt, demanded, processes_wanted
@@ -33,38 +34,33 @@ class Reached:
 
 
 def learn(
-    problem: Problem,
-    few: Callable[[], Problem],
-    motion: Motion,
-    first_frames: int,
-    seed: int,
-    checkpoint: Checkpoint,
-    progress: Progress,
+    throws: Sequence[Throw], few: Callable[[], Problem], seed: int, checkpoint: Checkpoint, progress: Progress
 ) -> Found:
-    """The neural law and the throw that explain ``problem`` best. few: the same with few particles, for the search of a
-    start. first_frames: how many frames the fit begins with. Raises MasivError."""
+    """The neural law that explains all ``throws`` best, and the motion of the first. few: the first with few particles,
+    for the search of a start. Raises MasivError."""
+    config = throws[0].problem.config
     saved = checkpoint.load() or {}
-    with Workers(processes_wanted(problem.config.processes), "identify.processes") as workers:
+    with Workers(processes_wanted(config.processes), "identify.processes") as workers:
         if "starts" in saved:
             starts = [_start_from(state) for state in saved["starts"]]
         else:
             workers.begin()
-            starts = _worth_fitting(choose_start(few(), motion, progress, workers))
+            starts = _worth_fitting(choose_start(few(), throws[0].motion, progress, workers))
         keeper = _With(checkpoint, {"starts": [_start_state(start) for start in starts]})
         if "starts" not in saved:
             keeper.save({})
         heard = silent if workers.processes > 1 else (lambda what, *said: progress(f"{what}, a rival", *said))
-        rest = [workers.beside(_reach_apart, (problem, s, motion, first_frames, seed, heard)) for s in starts[1:]]
-        first = attempt(_reach, (problem, starts[0], motion, first_frames, seed, keeper, progress))
+        rest = [workers.beside(_reach_apart, (throws, s, seed, heard)) for s in starts[1:]]
+        first = attempt(_reach, (throws, starts[0], seed, keeper, progress))
         ends = [(starts[0], first), *((start, waited()) for start, waited in zip(starts[1:], rest, strict=True))]
     reached = [_reached_from(start, end) for start, end in ends if not isinstance(end, Failed)]  # it diverges, perhaps
     kept = _best(reached) if reached else demanded(first)
     report: dict[str, Any] = {
         "start": kept.start.material, "start_objective": kept.start.error,
-        "geometry_loss": problem.config.geometry_loss, **kept.report,
+        "geometry_loss": config.geometry_loss, "throws": len(throws), **kept.report,
     }  # fmt: skip
     fitted = kept.fitted
-    return Found(fitted.law, fitted.motion, kept.start.contact, fitted.error_m, report, history_rows(fitted))
+    return Found(fitted.law, fitted.motions[0], kept.start.contact, fitted.error_m, report, history_rows(fitted))
 
 
 def _worth_fitting(starts: list[Start]) -> list[Start]:
@@ -79,7 +75,7 @@ def _best(reached: list[Reached]) -> Reached:
 
 
 def _reach(
-    problem: Problem, start: Start, motion: Motion, first: int, seed: int, checkpoint: Checkpoint, progress: Progress
+    throws: Sequence[Throw], start: Start, seed: int, checkpoint: Checkpoint, progress: Progress
 ) -> dict[str, Any]:
     """The state of a fit from ``start`` after everything that is done to one.
 
@@ -89,23 +85,21 @@ def _reach(
     if "fitted" in saved:
         fitted = fit_from(saved["fitted"], NeuralLaw(width=start.law.width))
     else:
-        fitted = fit(
-            problem, start.law, motion, start.contact, first, seed=seed, checkpoint=checkpoint, progress=progress
-        )  # fmt: skip
+        fitted = fit(throws, start.law, start.contact, seed=seed, checkpoint=checkpoint, progress=progress)
     error, seen = fitted.objective, {}
-    if wanted(problem):
+    if all(wanted(throw.problem) for throw in throws):
         keeper = _With(checkpoint, {"fitted": fit_state(fitted)})
         if "fitted" not in saved:
             keeper.save({})
         fitted, error, seen = polish(
-            problem, fitted, start.contact, start.law, seed=seed, checkpoint=keeper, progress=progress
+            throws, fitted, start.contact, start.law, seed=seed, checkpoint=keeper, progress=progress
         )  # fmt: skip
     return {"fitted": fit_state(fitted), "error": error, "report": seen}
 
 
-def _reach_apart(problem: Problem, start: Start, motion: Motion, first: int, seed: int, progress: Progress) -> dict:
+def _reach_apart(throws: Sequence[Throw], start: Start, seed: int, progress: Progress) -> dict[str, Any]:
     """``_reach`` as a task of another process."""
-    return _reach(problem, start, motion, first, seed, Checkpoint(None), progress)
+    return _reach(throws, start, seed, Checkpoint(None), progress)
 
 
 def _reached_from(start: Start, state: dict[str, Any]) -> Reached:

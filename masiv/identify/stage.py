@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +14,9 @@ from masiv.continuum.trajectory import Trajectory
 from masiv.identify.baseline import identify_classical
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.few import at_random
-from masiv.identify.launch import estimate_launch
 from masiv.identify.learn import learn
 from masiv.identify.problem import Motion, Problem
+from masiv.identify.throw import Throw, throw_of
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
@@ -28,6 +29,7 @@ def identify(
     config: IdentifyConfig,
     simulator: SimulatorConfig,
     *,
+    others: Sequence[tuple[Scene, Trajectory]] = (),
     seed: int = 0,
     checkpoint: Checkpoint | None = None,
     progress: Progress = silent,
@@ -35,37 +37,38 @@ def identify(
     """The twin of what ``trajectory`` (over the frames of ``scene``) shows. Raises MasivError where no law explains it.
 
     With ``config.law`` neural nothing is assumed of the material: the pretrained law whose rollout is nearest to the
-    motion is only the start. Otherwise the law is a classical one, or an adapter on one.
+    motion is only the start. Otherwise the law is a classical one, or an adapter on one. others: more throws of the
+    same object, from which a neural law is learnt, too; raises InputError for any other law.
 
     Where ``config.processes`` lets several processes look for that start, ``scene`` must be picklable, and a script
     needs ``if __name__ == "__main__":`` around what it does.
     """
+    if others:
+        config.refuse_more_throws()
     with runtime.torch_threads(1):
-        return _identify(scene, trajectory, config, simulator, seed, checkpoint or Checkpoint(None), progress)
+        seen = [(scene, trajectory), *others]
+        return _identify(seen, config, simulator, seed, checkpoint or Checkpoint(None), progress)
 
 
 def _identify(
-    scene: Scene,
-    trajectory: Trajectory,
+    seen: Sequence[tuple[Scene, Trajectory]],
     config: IdentifyConfig,
     simulator: SimulatorConfig,
     seed: int,
     checkpoint: Checkpoint,
     progress: Progress,
 ) -> Twin:
-    problem = Problem(scene, trajectory, config, simulator)
-    launch = estimate_launch(
-        trajectory.positions, trajectory.times, scene.gravity, scene.ground, clearance=problem.spacing
-    )
-    axes = problem.axes
-    motion = Motion.of_world(axes, launch.velocity, launch.omega)
-    first_frames = min(launch.last_frame + 2, problem.frames)
+    scene, trajectory = seen[0]
+    throws, launches = zip(*(throw_of(*one, config, simulator) for one in seen), strict=True)
+    first, launch, axes = throws[0], launches[0], throws[0].problem.axes
     chosen = at_random(trajectory.positions.shape[1], config.search_particles, seed)
     few = functools.partial(Problem, scene, trajectory, config, simulator, chosen=chosen)
     if config.law == "neural":
-        found = learn(problem, few, motion, first_frames, seed, checkpoint, progress)
+        found = learn(throws, few, seed, checkpoint, progress)
     else:
-        found = identify_classical(problem, few(), motion, first_frames, seed, checkpoint, progress)
+        found = identify_classical(
+            first.problem, few(), first.motion, first.first_frames, seed, checkpoint, progress
+        )  # fmt: skip
     return Twin(
         positions=np.asarray(trajectory.positions[0], dtype=np.float32),
         velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
@@ -113,7 +116,8 @@ def relearn(
     raised = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
     motion = Motion.of_world(axes, twin.velocity, twin.omega, raised)
     with runtime.torch_threads(1):
-        found = learn(problem, few, motion, (problem.frames + 1) // 2, seed, checkpoint or Checkpoint(None), progress)
+        throw = Throw(problem, motion, (problem.frames + 1) // 2)
+        found = learn([throw], few, seed, checkpoint or Checkpoint(None), progress)
     return replace(
         twin,
         velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
