@@ -26,8 +26,8 @@ class Fitted:
     """A model with its parameters. residual (M,) [m] of the fitted instants, weighted; jacobian (M, P) of it.
 
     cost [m^2]: robust mean square; samples: independent residuals. fit_mm and held_out_mm: root mean square distance,
-    not weighted; held_out_mm is None where nothing is held out. squares: of each experiment, the mean square distance
-    (K,) [m^2] at all instants. stderr: of each of the values.
+    not weighted; held_out_mm is None where nothing is held out. fields: of each experiment, simulated less observed
+    (K, N, A) [m] at all instants. stderr: of each of the values.
     """
 
     model: Model
@@ -39,8 +39,13 @@ class Fitted:
     samples: int
     fit_mm: float
     held_out_mm: float | None
-    squares: list[np.ndarray]
+    fields: list[np.ndarray]
     stderr: dict[str, float]
+
+    @property
+    def squares(self) -> list[np.ndarray]:
+        """Of each experiment, the mean square distance (K,) [m^2] at all instants."""
+        return [(field**2).sum(2).mean(1) for field in self.fields]
 
     def bic(self, samples: int) -> float:
         """Bayesian information criterion of ``samples`` independent residuals. Compare models at one number of samples:
@@ -273,7 +278,7 @@ def summarised(
     }
     return Fitted(
         model, dict(values), tuple(params), residual, jacobian, robust_cost(residual, soft), samples,
-        rms_mm(fit), rms_mm(rest) if rest else None, [(f**2).sum(2).mean(1) for f in fields], stderr,
+        rms_mm(fit), rms_mm(rest) if rest else None, fields, stderr,
     )  # fmt: skip
 
 

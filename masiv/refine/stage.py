@@ -106,11 +106,8 @@ def refine(
             if dry_run:
                 config = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
             outcome = close_loop(simulation, fits, config, progress, workers)
-        before = simulation.fields(outcome.before.model, outcome.before.values, held_out=True)
-        final = outcome.gap or outcome.after
-        after = simulation.fields(final.model, final.values, held_out=True)
         proposal = None if dry_run else propose(simulation, outcome, progress)
-        return Refined(outcome, simulation, before, after, proposal)
+        return Refined(outcome, simulation, outcome.before.fields, (outcome.gap or outcome.after).fields, proposal)
 
 
 def twin_of(fitted: Fitted, throw: Throw, simulation: Simulation, old: Twin) -> Twin:

@@ -12,7 +12,7 @@ from masiv.refine.answer import answer
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess
 from masiv.refine.loop import STOP_GAP
-from masiv.refine.model import Experiment, effect_parameters
+from masiv.refine.model import GRID_CHANGE, Experiment, effect_parameters
 from masiv.refine.refit import Fitted, rms_mm, split
 from masiv.refine.rounds import Round, like_accepted
 from masiv.refine.score import Candidate
@@ -40,6 +40,9 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
         "schema": 1,
         "noise_floor_mm": 1e3 * experiment.noise,
         "grid_floor_mm": _grid_floor(experiment),
+        "grid_share": {
+            "before": _grid_share(outcome.before, experiment), "after": _grid_share(outcome.after, experiment)
+        },
         "residual_over_floor": {
             "before": excess(outcome.before, experiments), "after": excess(outcome.after, experiments)
         },
@@ -67,8 +70,13 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
     }  # fmt: skip
 
 
+def _grid_share(fitted: Fitted, experiment: Experiment) -> float | None:
+    """How much there is of what finer grids change on average."""
+    return fitted.values.get(f"{GRID_CHANGE}@{experiment.name}")
+
+
 def _grid_floor(experiment: Experiment) -> dict[str, float | None]:
-    """What a finer grid changes, root mean square [mm] over the fitted and the held-out instants."""
+    """By how much one grid more may differ, root mean square [mm] over the fitted and the held-out instants."""
     grid = experiment.sigma**2 - experiment.noise**2
     rest = grid[experiment.rows :]
     fit = 1e3 * math.sqrt(max(float(grid[: experiment.rows].mean()), 0.0))
