@@ -26,6 +26,7 @@ def document(**changes):
     refused = refit | {"effect": "swirl", "accepted": False, "objections": ["held out <gets> worse"], "parameters": {}}
     whole = {
         "schema": 1, "noise_floor_mm": 2.5, "grid_floor_mm": {"fit": 3.0, "held_out": 4.0},
+        "grid_share": {"before": 0.4, "after": 0.625},
         "residual_mm": {"fit": 10.7, "held_out": 40.2},
         "candidates": [
             {"effect": "linear_drag", "explained": 0.81, "theta": 0.7, "unit": "1/s", "stderr": 0.02,
@@ -73,17 +74,18 @@ def test_numbers_and_pictures_of_an_accepted_effect(tmp_path):
     assert section.count("data:image/png;base64,") == 2
     shown = ["effect added: linear drag", "0.7234", "0.0213", "81 %", "10.7 → 4.2", "40.2 → 13.1", "quadratic drag"]
     markup = ["held out &lt;gets&gt; worse", "slows &amp; slows"]  # text is never markup
+    assert "0.625 of what finer grids change" in section
     assert [text for text in (*shown, "61", "12 to 15", "0.31", *markup) if text not in section] == []
 
 
 def test_nothing_found(tmp_path):
     alone = {"fit": ERRORS["fit"], "held_out": {}}
     found = document(accepted=[], candidates=[], rounds=[], next_experiment=None, before=alone, after=alone,
-                     verdict="nothing missing")  # fmt: skip
+                     verdict="nothing missing", grid_share=None)  # fmt: skip
     write(tmp_path, found, fields(instants=12, fitted=12))
     section = refine_section(tmp_path)
     assert "nothing missing" in section
-    assert [text for text in ("What was added", "held out", "Refits") if text in section] == []
+    assert [text for text in ("What was added", "held out", "Refits", "finer grids") if text in section] == []
 
 
 def test_a_stop_gap_is_called_one(tmp_path):

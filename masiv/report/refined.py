@@ -76,8 +76,16 @@ def _verdict(document: Mapping[str, Any]) -> str:
     return (
         f"Verdict: {answer(document)}. Residual (simulated less observed) on "
         f"{', on '.join(errors)}; noise floor of the observation {number(document['noise_floor_mm'])} mm. "
-        f"Classical law with its best parameters: {law}. {document['rollouts']} rollouts."
+        f"Classical law with its best parameters: {law}. {document['rollouts']} rollouts.{_grid(document)}"
     )
+
+
+def _grid(document: Mapping[str, Any]) -> str:
+    """How much of what finer grids change is in the motion that the residual is of; nothing where none was fitted."""
+    share = (document.get("grid_share") or {}).get("after")
+    if share is None:
+        return ""
+    return f" Simulated with few particles; {number(share)} of what finer grids change on average is added."
 
 
 def _mm(errors: Mapping[str, Any], split: str) -> str:
