@@ -151,6 +151,8 @@ def test_evidence():
     assert "of what noise" in judged(fits(1.6, 1.6), fits(1.0, 1.5))[0]  # less than noise
     assert "held-out" in judged(fits(9, 20), fits(6, 22))[0]  # held-out instants contradict
     assert judged(fits(9, 20), fits(2, 20)) == []  # they cannot tell, the fitted ones are plain
+    assert judged(fits(9, 20), fits(2, 17)) == []  # nor does a little in favour (8 %) count against it
+    assert "held-out" in judged(fits(9, 20), fits(2, 22))[0]
     assert "held-out" in judged(fits(9, 20), fits(6, 20))[0]  # not plain enough for that
     # Plain beside a noise as smooth as what is left; not where held-out instants contradict, nor for next to nothing.
     assert judged(fits(9, 20), fits(6, 20), sure=7.0) == []

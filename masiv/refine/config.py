@@ -53,7 +53,7 @@ class RefineConfig(BaseModel):
     decisive: float = Field(
         4.0, ge=1,
         description="variance that an effect must explain, over the noise's, in the phase where the simulation is as "
-        "certain as the observation, to be accepted although held-out frames are too uncertain to tell",
+        "certain as the observation, to be accepted although held-out frames confirm little and contradict nothing",
     )  # fmt: skip
     plain_sigmas: float = Field(
         6.0, ge=0,

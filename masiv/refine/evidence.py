@@ -126,8 +126,8 @@ def explains_too_little(
 
     Three kinds of evidence are enough: a part of the held-out error that is the larger (``least_gain`` to
     ``decisive_gain``) the less is explained of what noise and grid could change in the fitted instants; held-out
-    instants that cannot tell, and a motion that is plain where the simulation is as certain as the observation (sure:
-    how many sigmas the effect is from none beside a smooth noise, worked out where that decides); or
+    instants that do not contradict, and a motion that is plain where the simulation is as certain as the observation
+    (sure: how many sigmas the effect is from none beside a smooth noise, worked out where that decides); or
     ``least_gain`` of the held-out error, for an effect that cannot adapt to an error of any shape (``adapts`` False: it
     is one number, and the criterion is clear).
     """
@@ -145,7 +145,7 @@ def explains_too_little(
     simple = not adapts and removed >= config.least_gain and share > 0
     if confirmed or simple:
         return []
-    if fitted.certain is not None and abs(won.mean()) < 1 and _plain(fitted.certain, config, sure):
+    if fitted.certain is not None and won.mean() > -1 and _plain(fitted.certain, config, sure):
         return []
     there = (
         f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * asked:.0f} %), "
@@ -168,8 +168,8 @@ def removed_of(was: np.ndarray, now: np.ndarray) -> float:
 
 
 def _plain(gained: float, config: RefineConfig, sure: Callable[[], float | None]) -> bool:
-    """Whether the variance that is ``gained`` in free flight, over the noise's, is enough where held-out instants
-    cannot tell; less is where noise as smooth as what is left does not look like the cause (``sure``, which takes
+    """Whether the variance that is ``gained`` in free flight, over the noise's, is enough where held-out instants do
+    not contradict; less is where noise as smooth as what is left does not look like the cause (``sure``, which takes
     seconds)."""
     if gained >= config.decisive or gained < 1:
         return gained >= config.decisive
