@@ -38,9 +38,9 @@ def variations(other: Path) -> dict[str, list[str]]:
 def row(run: Path, label: str, options: list[str], frames: int, view: int) -> np.ndarray:
     """Pictures (H, W, 3) uint8 of one variation side by side, under its label."""
     with tempfile.TemporaryDirectory() as folder:
-        command = ["masiv", "simulate", str(run), "--frames", str(frames), "--render", "--view", str(view)]
-        program = [sys.executable, "-c", "from masiv.cli.main import run; run()"]
-        subprocess.run([*program, *command[1:], *options, "--out", folder], check=True)
+        masiv = [sys.executable, "-c", "from masiv.cli.main import run; run()"]
+        given = ["simulate", str(run), "--frames", str(frames), "--render", "--view", str(view), "--out", folder]
+        subprocess.run([*masiv, *given, *options], check=True)
         paths = sorted(Path(folder, "views").rglob("*.png"))
         chosen = [cv2.imread(str(paths[round(m * (len(paths) - 1))])) for m in MOMENTS]
     strip = np.concatenate(chosen, axis=1)
