@@ -16,25 +16,25 @@ from masiv.refine import second_look
 from masiv.refine.add_effect import absent
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
-from masiv.refine.grids import weighed
+from masiv.refine.grids import weighed, with_grid_errors
 from masiv.refine.loop import in_reach
 from masiv.refine.model import Model, Simulation
-from masiv.refine.refit import best_strength, column, leapt, strengths_alone
+from masiv.refine.refit import Fitted, best_strength, column, leapt, strengths_alone
 from masiv.refine.score import score
-from masiv.refine.simulated import Term
+from masiv.refine.simulated import Term, Weighing
 
 INSTANTS, ROWS, POINTS = 6, 4, 5
 NOISE = 1e-3
 
 
 @dataclass(frozen=True)
-class Watched:
+class Watched(Weighing):
     noise: float = NOISE
     sigma: np.ndarray = None
     instants: int = INSTANTS
     rows: int = ROWS
     holds_out: bool = True
-    grid_change: np.ndarray | None = None
+    grid_changes: tuple[np.ndarray, ...] = ()
 
 
 class Linear:
@@ -119,7 +119,7 @@ def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
     common, apart = 3e-2 * random.normal(size=shape), 1e-2 * random.normal(size=shape)
     alike = found(common, 1.2 * common + absorbed)
     np.testing.assert_allclose(alike.sigma, NOISE, rtol=1e-6)
-    np.testing.assert_allclose(alike.grid_change, 1.1 * common + absorbed / 2)
+    np.testing.assert_array_equal(alike.grid_changes, [common, 1.2 * common + absorbed])
     differing = found(common + apart, common - apart)
     rms = np.sqrt((apart**2).sum(2).mean(1))
     # A third grid is off the mean of two by the square root of three times as much as they are.
@@ -131,8 +131,31 @@ def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
     share = Parameter("grid_change@0", 0.0, -1.0, 3.0, 0.25)
     again = SimpleNamespace(jacobian=columns, model=None, values={}, parameters=[share, *parameters()])
     np.testing.assert_array_equal(found(common + apart, common - apart, fitted=again).sigma, differing.sigma)
-    assert found().grid_change is None
+    assert found().grid_changes == ()
     np.testing.assert_array_equal(found().sigma, NOISE)
+
+
+def test_standard_errors_hold_what_one_more_grid_would_move():
+    random = np.random.default_rng(3)
+    jacobian = random.normal(size=(ROWS * POINTS * 3, 2))
+    common, apart = np.zeros((2, INSTANTS, POINTS, 3))
+    common[:ROWS] = 1e-2 * random.normal(size=(ROWS, POINTS, 3))
+    apart[:ROWS] = 1e-2 * (jacobian @ np.array([3.0, -0.5])).reshape(ROWS, POINTS, 3)
+    simulation = Linear(jacobian, 0.0)
+    share = Parameter("grid_change@0", 0.0, -1.0, 3.0, 0.25)
+    values = {share.name: 0.7, "a": 1.0, "b": 2.0}
+    columns = np.concatenate([common[:ROWS].reshape(-1, 1), jacobian], axis=1)
+    params = [share, parameters()[0], Parameter("b", 1.0, 0.1, 9.0, 1e-3, log=True)]
+    errors = dict(zip(values, (0.1, 0.01, 0.02), strict=True))
+    fitted = Fitted(None, values, tuple(params), np.zeros(len(jacobian)), columns, 1.0, 9, 1.0, 1.0, [], errors)
+    assert with_grid_errors(simulation, fitted, 1.0) is fitted  # no grid is known to change anything
+    changes = (common + apart, common - apart)
+    simulation.experiments = (replace(simulation.experiments[0], grid_changes=changes),)
+    found = with_grid_errors(simulation, fitted, 1.0).stderr
+    # The mean's own size is what its share is for; a third grid is off it by the square root of three times as much.
+    assert found[share.name] == pytest.approx(errors[share.name])
+    assert found["a"] == pytest.approx(np.hypot(0.01, np.sqrt(3) * 1e-2 * 3.0))
+    assert found["b"] == pytest.approx(np.hypot(0.02, np.sqrt(3) * 1e-2 * 0.5 * values["b"]))
 
 
 def fits(*levels, count=3):
@@ -274,7 +297,7 @@ def test_a_model_has_a_share_of_what_finer_grids_change():
     values = {p.name: p.start for p in simulation.parameters(model)}
     (without,) = simulation.fields(model, values)
     change = np.random.default_rng(0).normal(size=(simulation.experiments[0].instants, *without.shape[1:]))
-    simulation.experiments = (replace(simulation.experiments[0], grid_change=change),)
+    simulation.experiments = (replace(simulation.experiments[0], grid_changes=(0.9 * change, 1.1 * change)),)
     share = simulation.parameters(model)[0]
     assert (share.name, share.start) == ("grid_change@run", 0.0)
     rolled = simulation.rollouts
@@ -284,7 +307,7 @@ def test_a_model_has_a_share_of_what_finer_grids_change():
     expected = simulation.experiments[0].weighted(change[: len(without)]).ravel()
     np.testing.assert_allclose(derivative, expected, rtol=1e-9, atol=1e-12)
     (whole,) = simulation.fields(model, {**values, share.name: 0.5}, held_out=True)
-    np.testing.assert_array_equal(whole[: len(without)], without + 0.5 * change[: len(without)])
+    np.testing.assert_allclose(whole[: len(without)], without + 0.5 * change[: len(without)], atol=1e-12)
 
 
 def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from masiv.identify.parametric import robust_weight
 from masiv.refine.model import GRID_CHANGE
 from masiv.refine.refit import Fitted
 from masiv.refine.simulated import Simulated
@@ -33,14 +34,45 @@ def weighed(simulation: Simulated, fitted: Fitted, observation: Sequence[np.ndar
         return tuple(replace(e, sigma=seen) for e, seen in zip(experiments, observation, strict=True))
     mean = [np.mean(changes, axis=0) for changes in found]
     kept = [_not_absorbed(simulation, fitted, observation, each, mean) for each in zip(*found, strict=True)]
-    # One more draw differs from the mean of these by more than they do.
-    more = math.sqrt((len(kept) + 1) / (len(kept) - 1))
+    more = _one_more(len(kept))
     out = []
     for k, (e, seen) in enumerate(zip(experiments, observation, strict=True)):
         whole = np.sqrt(np.mean([_size(change) ** 2 for change in found[k]], axis=0))
         grid = np.minimum(more * np.sqrt(np.mean([each[k] ** 2 for each in kept], axis=0)), whole)
-        out.append(replace(e, sigma=np.hypot(seen, np.maximum.accumulate(grid)), grid_change=mean[k]))
+        out.append(replace(e, sigma=np.hypot(seen, np.maximum.accumulate(grid)), grid_changes=tuple(found[k])))
     return tuple(out)
+
+
+def with_grid_errors(simulation: Simulated, fitted: Fitted, soft: float) -> Fitted:
+    """``fitted`` with standard errors that hold, beside what noise does to the values, by how much they would move if
+    the truth were one more grid: with what it changes beyond the mean, which no share makes up for.
+
+    soft [m]: residuals from which on a weighted residual counts as wild.
+    """
+    experiments = simulation.experiments
+    if not all(e.grid_changes for e in experiments) or not fitted.parameters:
+        return fitted
+    beyond = [
+        [e.weighted((c - np.mean(e.grid_changes, axis=0))[: e.rows]) for c in e.grid_changes] for e in experiments
+    ]
+    weight = robust_weight(fitted.residual, soft)
+    columns = fitted.jacobian * weight[:, None]
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    moved = []
+    for grid in zip(*beyond, strict=True):
+        change = np.concatenate([field.ravel() for field in grid])
+        moved.append(np.linalg.lstsq(columns / scale, change * weight, rcond=1e-8)[0] / scale)
+    apart = _one_more(len(moved)) * np.sqrt(np.mean(np.square(moved), axis=0))
+    errors = {
+        p.name: math.hypot(fitted.stderr[p.name], change * (abs(fitted.values[p.name]) if p.log else 1.0))
+        for p, change in zip(fitted.parameters, apart, strict=True)
+    }
+    return replace(fitted, stderr={**fitted.stderr, **errors})
+
+
+def _one_more(count: int) -> float:
+    """By how many times more one more draw differs from the mean of ``count`` than these do."""
+    return math.sqrt((count + 1) / (count - 1))
 
 
 def _size(field: np.ndarray) -> np.ndarray:

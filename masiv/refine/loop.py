@@ -12,7 +12,7 @@ from masiv.errors import MasivError
 from masiv.refine.add_effect import CHORD_STEPS, refit
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import above_noise, excess, objections
-from masiv.refine.grids import weighed
+from masiv.refine.grids import weighed, with_grid_errors
 from masiv.refine.naming import named
 from masiv.refine.refit import Fitted, carried, full_fit, held_in, ordered, reweighted, softness, strengths_alone
 from masiv.refine.rounds import TELLS_APART, Round, Trial, confusable
@@ -87,7 +87,8 @@ def close_loop(
     gap = None
     if config.shortlist and excess(current, experiments) > config.unexplained:
         gap = stop_gap(simulation, current, soft, config, say)
-    return Outcome(before, current, rounds, gap)
+    known = with_grid_errors(simulation, current, soft)
+    return Outcome(known if current is before else before, known, rounds, gap)
 
 
 def _told_apart(current: Fitted, first: Round, looks: Sequence[Round]) -> Fitted:

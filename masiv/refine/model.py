@@ -34,8 +34,8 @@ class Experiment(Weighing):
     motion: of ``problem``'s start, simulation frame, as ``flight``, its last frame of free flight, and those before
     have it. finer: the same on finer grids with all particles, of which those
     of ``problem`` are some. noise: of the observation [m]. sigma (K,): by how much model and observation may differ at
-    each instant [m] with nothing missing; the noise while the rest is not known. grid_change (K, N, 3) [m]: what finer
-    grids change on average, of which a model may have a share; None while that is not known.
+    each instant [m] with nothing missing; the noise while the rest is not known. grid_changes: what each finer grid
+    changes (K, N, 3) [m]; none while that is not known.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Experiment(Weighing):
     finer: tuple[Problem, ...]
     noise: float
     sigma: np.ndarray
-    grid_change: np.ndarray | None = None
+    grid_changes: tuple[np.ndarray, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -61,6 +61,11 @@ class Experiment(Weighing):
     def instants(self) -> int:
         """All of them."""
         return self.problem.frames * self.problem.samples
+
+    @property
+    def grid_change(self) -> np.ndarray:
+        """What finer grids change on average (K, N, 3) [m], of which a model may have a share."""
+        return np.mean(self.grid_changes, axis=0)
 
     @property
     def places(self) -> np.ndarray:
@@ -90,9 +95,7 @@ def parameters(model: Model, experiments: Sequence[Experiment]) -> tuple[Paramet
         for p in motion_parameters(e.problem, e.motion)
         if p.name not in gone
     ]
-    grids = [
-        Parameter(f"{GRID_CHANGE}@{e.name}", 0.0, -1.0, 3.0, 0.25) for e in experiments if e.grid_change is not None
-    ]
+    grids = [Parameter(f"{GRID_CHANGE}@{e.name}", 0.0, -1.0, 3.0, 0.25) for e in experiments if e.grid_changes]
     # Grids first: their derivatives need no other rollout than the one before.
     return (*grids, *model.family.parameters, *own, *(p for name in model.effects for p in effect_parameters(name)))
 
@@ -233,7 +236,7 @@ class Simulation:
             frames = experiment.problem.frames if held_out else experiment.fitted - 1
             found = self.positions(model, values, index, frames)
             field = (found - experiment.problem.targets[: len(found)]).double().numpy()
-            if experiment.grid_change is not None:
+            if experiment.grid_changes:
                 share = values.get(f"{GRID_CHANGE}@{experiment.name}", 0.0)
                 field += share * experiment.grid_change[: len(found)]
             out.append(field)

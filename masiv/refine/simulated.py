@@ -63,13 +63,17 @@ def plain_term(name: str, setting: Setting) -> Term:
 class Watched(Protocol):
     """One experiment: K instants at which N points are compared, the first ``rows`` of them fitted, the rest held
     out. noise [m]: of the observation; sigma (K,) [m]: by how much model and observation may differ with nothing
-    missing. ``dataclasses.replace`` gives it another sigma."""
+    missing; grid_changes: what each finer grid changes (K, N, A) [m], none while that is not known.
+    ``dataclasses.replace`` gives it another sigma."""
 
     @property
     def noise(self) -> float: ...
 
     @property
     def sigma(self) -> np.ndarray: ...
+
+    @property
+    def grid_changes(self) -> tuple[np.ndarray, ...]: ...
 
     @property
     def instants(self) -> int: ...
@@ -98,6 +102,7 @@ class Weighing:
 
     noise: float
     sigma: np.ndarray
+    grid_changes: tuple[np.ndarray, ...] = ()
 
     def weighted(self, field: np.ndarray) -> np.ndarray:
         """A residual (K, N, A) [m] from the first instant on: as it is where sigma is the noise, less where the model
