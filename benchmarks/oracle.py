@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 
 def oracle(simulation, outcome, *, law: str, contact: str, parameters: Mapping[str, float], effects: Mapping) -> dict:
-    """Fit the true law with the true effects, which begin at their true values: {fit_mm, held_out_mm, values}, the
-    better of the fits whose throw begins at that of refine's model without effects, and of its last; {problem} where
-    both diverge.
+    """{fit_mm, held_out_mm, values} of ``told``, whose throw begins at that of refine's model without effects, or of
+    its last; {problem} where both diverge."""
+    from masiv.errors import MasivError
+
+    starts = [outcome.before] if outcome.after is outcome.before else [outcome.before, outcome.after]
+    try:
+        # Its own substeps: those that the search settled on may be too long for the true stiffness.
+        best = told(type(simulation)(simulation.experiments), starts, law, contact, parameters, effects)
+    except MasivError as failed:
+        return {"problem": str(failed)}
+    found = {n: v for n, v in best.values.items() if "@" not in n}
+    return {"fit_mm": best.fit_mm, "held_out_mm": best.held_out_mm, "values": found}
+
+
+def told(simulation, starts: Sequence, law: str, contact: str, parameters: Mapping[str, float], effects: Mapping):
+    """The true law with the true effects, fitted from their true values and the throws of ``starts``: the best of these
+    fits. Raises MasivError where all diverge.
 
     parameters: of the law, effects: {effect: {parameter: value}}.
     """
@@ -17,20 +31,15 @@ def oracle(simulation, outcome, *, law: str, contact: str, parameters: Mapping[s
     from masiv.refine.model import Model, effect_parameters
     from masiv.refine.refit import full_fit
 
-    # Its own substeps: those that the search settled on may be too long for the true stiffness.
-    simulation = type(simulation)(simulation.experiments)
     model = Model(FAMILIES[law], contact, tuple(effects))
-    told = {p.name: effects[n][p.name.split(".")[1]] for n in effects for p in effect_parameters(n)}
-    fits, problem = [], ""
-    starts = [outcome.before] if outcome.after is outcome.before else [outcome.before, outcome.after]
+    true = {p.name: effects[n][p.name.split(".")[1]] for n in effects for p in effect_parameters(n)}
+    fits, problem = [], None
     for start in starts:
         throw = {n: v for n, v in start.values.items() if "@" in n}
         try:
-            fits.append(full_fit(simulation, model, {**throw, **parameters, **told}, budget=24))
+            fits.append(full_fit(simulation, model, {**throw, **parameters, **true}, budget=24))
         except MasivError as failed:
-            problem = str(failed)
-    if not fits:
-        return {"problem": problem}
-    best = min(fits, key=lambda f: f.fit_mm)
-    found = {n: v for n, v in best.values.items() if "@" not in n}
-    return {"fit_mm": best.fit_mm, "held_out_mm": best.held_out_mm, "values": found}
+            problem = failed
+    if problem is not None and not fits:
+        raise problem
+    return min(fits, key=lambda f: f.fit_mm)

@@ -3,7 +3,7 @@
     python benchmarks/refine_tracks.py --out FILE.jsonl [--only NAME] [--particles 1500] [--set KEY=VALUE …]
 
 One JSON line a case; cases already in FILE are skipped, so that a stopped run goes on. ``--table FILE`` prints the
-confusion table.
+confusion table. ``--oracle`` fits models that were told, instead; ``--table FILE --oracles FILE2`` shows both.
 """
 
 import argparse
@@ -84,23 +84,18 @@ def cases():
     return sorted(out, key=lambda case: case.law != "neo_hookean" or case.name.endswith("_stiff"))
 
 
-def refined(case, config, with_oracle):
+def begun(case, config):
+    """Simulation, experiment, and fits of laws without effects."""
     import torch
-    from oracle import oracle
     from track_cases import observed
 
     from masiv.checkpoint import Checkpoint
     from masiv.identify.config import IdentifyConfig
     from masiv.mpm.config import SimulatorConfig
     from masiv.refine.baselines import baselines
-    from masiv.refine.evidence import excess
-    from masiv.refine.loop import close_loop
     from masiv.refine.model import Simulation
     from masiv.refine.observed import SampledMotion
     from masiv.refine.prepare import experiment_of
-    from masiv.refine.rounds import like_accepted
-    from masiv.refine.stage import Refined
-    from masiv.refine.summary import verdict
 
     torch.set_num_threads(1)
     scene, motion = observed(case)
@@ -110,14 +105,42 @@ def refined(case, config, with_oracle):
         "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
     )
     simulation = Simulation([experiment])
-    began = time.time()
     fits = baselines(simulation, few, fewer, min(launch.last_frame + 2, few.frames), config, Checkpoint(None), quiet)
+    return simulation, experiment, fits
+
+
+def told_of(case, config):
+    """Error of a model that was told, weighed as refine weighs what it has found: as that model moves."""
+    from oracle import told
+
+    from masiv.refine.loop import weigh
+    from masiv.refine.model import Simulation
+
+    began = time.time()
+    simulation, _, fits = begun(case, config)
+    observation = [e.sigma for e in simulation.experiments]
+    best = min(fits, key=lambda f: f.cost)
+    weigh(simulation, best, observation)
+    own = Simulation(simulation.experiments)  # with substeps that the true stiffness asks for
+    best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
+    weigh(own, best, observation)
+    best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
+    return {"case": case.name, "oracle": [best.fit_mm, best.held_out_mm], "seconds": [time.time() - began]}
+
+
+def refined(case, config):
+    from masiv.refine.evidence import excess
+    from masiv.refine.loop import close_loop
+    from masiv.refine.rounds import like_accepted
+    from masiv.refine.stage import Refined
+    from masiv.refine.summary import verdict
+
+    began = time.time()
+    simulation, experiment, fits = begun(case, config)
     middle = time.time()
     outcome = close_loop(simulation, fits, config, quiet)
     end = time.time()
     first = outcome.rounds[0] if outcome.rounds else None
-    known = {"law": case.law, "contact": case.contact, "parameters": case.parameters, "effects": case.effects}
-    told = {} if case.outside or not with_oracle else oracle(simulation, outcome, **known)
     return {
         "case": case.name,
         "true": {**case.effects, **case.outside},
@@ -140,7 +163,6 @@ def refined(case, config, with_oracle):
         "confusable": first.confusable if first else {},
         "before": [outcome.before.fit_mm, outcome.before.held_out_mm],
         "after": [outcome.after.fit_mm, outcome.after.held_out_mm],
-        "oracle": [told.get("problem") or told["fit_mm"], told.get("held_out_mm")] if told else None,
         "seconds": [middle - began, end - middle],
     }  # fmt: skip
 
@@ -152,16 +174,20 @@ def quiet(*_):
 ANSWERS = "named", "named, with others beside it", "one of others beside it", "abstained", "wrong"
 
 
-def table(path):
-    rows = [json.loads(line) for line in Path(path).read_text().splitlines()]
+def lines(path):
+    return [json.loads(line) for line in Path(path).read_text().splitlines()]
+
+
+def table(path, oracles):
+    rows, told = lines(path), {r["case"]: r["oracle"] for r in lines(oracles)} if oracles else {}
     counts = dict.fromkeys(ANSWERS, 0)
     print("| case | accepted | may as well be | first ranked | before fit / held out [mm] | after | oracle | s |")
     print("|---|---|---|---|---|---|---|---|")
     for r in rows:
         counts[judged(r)] += 1
         others = ", ".join(other for names in r["or_else"].values() for other in names)
-        show = [" / ".join(f"{v:.1f}" for v in r[k]) if isinstance(r[k], list) else "–"
-                for k in ("before", "after", "oracle")]  # fmt: skip
+        show = [" / ".join(f"{v:.1f}" for v in pair) if pair else "–"
+                for pair in (r["before"], r["after"], told.get(r["case"]))]  # fmt: skip
         ranked = f"{r['ranked'][0][0]} {r['ranked'][0][1]}" if r["ranked"] else "–"
         print(f"| {r['case']} | {', '.join(r['accepted']) or 'none'} | {others} | {ranked} | {show[0]} | {show[1]} | "
               f"{show[2]} | {sum(r['seconds']):.0f} |")  # fmt: skip
@@ -187,29 +213,33 @@ def main():
     parser.add_argument("--laws", default="", help="families that compete, with commas; the case's own where empty")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of refine")
     parser.add_argument("--per-cell", type=float, default=6.0, help="particles a cell of the truth's grid")
-    parser.add_argument("--no-oracle", action="store_true", help="do not fit a model that was told the effect")
+    parser.add_argument("--oracle", action="store_true", help="fit models that were told the effect, instead")
     parser.add_argument("--table")
+    parser.add_argument("--oracles", help="with --table: the file that --oracle wrote")
     options = parser.parse_args()
     if options.table:
-        table(options.table)
+        table(options.table, options.oracles)
         return
     from masiv import runtime
     from masiv.refine.config import RefineConfig
 
     runtime.start("cpu")
     out = Path(options.out)
-    done = {json.loads(line)["case"] for line in out.read_text().splitlines()} if out.exists() else set()
+    done = {row["case"] for row in lines(out)} if out.exists() else set()
     for case in cases():
         if case.name in done or (options.only and options.only not in case.name):
             continue
+        if options.oracle and case.outside:
+            continue  # no model of the library could be told
         laws = [n for n in options.laws.split(",") if n] or [case.law]
         settings = {"particles": options.particles, "laws": laws}
         settings |= {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in options.set)}
         case = dataclasses.replace(case, per_cell=options.per_cell)
-        row = refined(case, RefineConfig.model_validate(settings), not options.no_oracle)
+        row = (told_of if options.oracle else refined)(case, RefineConfig.model_validate(settings))
         with out.open("a") as file:
             file.write(json.dumps(row) + "\n")
-        print(case.name, "->", row["accepted"], [round(x) for x in row["seconds"]], flush=True)
+        answer = row["oracle"] if options.oracle else row["accepted"]
+        print(case.name, "->", answer, [round(x) for x in row["seconds"]], flush=True)
 
 
 if __name__ == "__main__":
