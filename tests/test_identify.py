@@ -11,8 +11,9 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.launch import estimate_launch
+from masiv.identify.problem import Motion, Problem
 from masiv.identify.stage import identify
-from masiv.identify.start import Start, best_first
+from masiv.identify.start import DIVERGED, STIFFEST, Start, _error, best_first
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.pretrain import pretrained_path
@@ -124,6 +125,16 @@ def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
     assert twin.fit["trajectory_error_mm"] < 8
     assert error[FRAMES:].mean() < 0.025 < rigid
     np.testing.assert_allclose(twin.velocity, VELOCITY, atol=0.1)
+
+
+def test_no_start_is_stiffer_than_a_motion_could_tell(seen):
+    problem = Problem(
+        scene(), seen[0], settings(), SimulatorConfig(), chosen=np.arange(0, len(seen[0].positions[0]), 4)
+    )
+    motion = Motion.of_world(problem.axes, VELOCITY, OMEGA)
+    errors = [_error(problem, motion, "jelly", "sticky", share * STIFFEST) for share in (0.5, 1.01)]
+    assert errors[0] < DIVERGED  # it could be simulated, and so could the stiffer one
+    assert errors[1] == DIVERGED
 
 
 def test_interrupted_identify_ends_with_the_same_numbers(seen, tmp_path):

@@ -24,6 +24,7 @@ from test_identify import (  # noqa: F401  (fixtures)
 from cli.main import run
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
+from masiv.identify.descent import Descent
 from masiv.identify.fit import fit
 from masiv.identify.stage import identify
 from masiv.identify.throw import throw_of
@@ -84,8 +85,19 @@ def test_a_law_of_two_throws_explains_both(seen, dropped):  # noqa: F811
         np.testing.assert_allclose(motion.velocity.numpy(), velocity, atol=0.1)
 
 
-def test_each_throw_counts_alike(seen, dropped):  # noqa: F811
+def test_each_throw_counts_alike(seen, dropped, monkeypatch):  # noqa: F811
     """A step from the same throw twice is that from it once (later ones differ: steps of motions are clipped)."""
+    gradients = []
+    of_law = len(list(stiffer(1.0).parameters()))
+    with monkeypatch.context() as patched:
+        patched.setattr(
+            Descent, "step", lambda self: gradients.append([p.grad.clone() for p in self._parameters[:of_law]])
+        )
+        one = throws(seen, dropped, settings(iterations=1))[:1]
+        fitted(one)
+        fitted(one * 2)
+    for once, twice in zip(*gradients, strict=True):
+        torch.testing.assert_close(twice, once, rtol=1e-4, atol=1e-7)
     one = throws(seen, dropped, settings(iterations=2))[:1]
     once, twice = fitted(one), fitted(one * 2)
     assert once.objective < fitted(one, law=stiffer(3.0)).objective

@@ -8,12 +8,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import fmean as mean
+from typing import Any
 
 import numpy as np
 import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
+from masiv.identify.descent import Descent
 from masiv.identify.objective import objective
 from masiv.identify.pictures import compared, picture_errors, picture_objective
 from masiv.identify.problem import Motion, Problem
@@ -21,10 +23,6 @@ from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress
-
-FAILURES_ALLOWED = 8
-RECOVERY = 1.4
-"""Step sizes that were halved grow by this factor with every step that succeeds."""
 
 
 @dataclass
@@ -70,78 +68,40 @@ def fit(
     config = throws[0].problem.config
     start, law = prior or law, copy.deepcopy(law)
     motions = [Motion(*(t.detach().clone().requires_grad_() for t in throw.motion.tensors())) for throw in throws]
-    if isinstance(law, NeuralLaw):
-        scales = law.scales()
-        weights = [*law.elastic.parameters(), *law.plastic.parameters()]
-    else:
-        scales, weights = [], [p for p in law.parameters() if p.requires_grad]
-    groups = [
-        (weights, config.law_learning_rate),
-        (scales, config.scale_learning_rate),
-        ([t for motion in motions for t in (motion.velocity, motion.omega)], config.velocity_learning_rate),
-        ([motion.ground_offset for motion in motions], config.ground_learning_rate),
-    ]
-    optimiser = torch.optim.Adam(
-        [{"params": p, "lr": rate, "rate": rate} for p, rate in groups if p], betas=(0.9, 0.95)
-    )
-    parameters = [*weights, *scales, *(t for motion in motions for t in motion.tensors())]
+    descent = Descent(law, motions, config, max(throw.problem.frames for throw in throws))
     best = Fit(copy.deepcopy(law), _copied(motions))
-    longest = max(throw.problem.frames for throw in throws)
-    first, caution, failures, reach = 0, 1.0, 0, longest
+    first = 0
     saved = checkpoint.load()
     if saved is not None and "fit" in saved:
-        first, caution, failures, reach = _restore(saved["fit"], parameters, optimiser, best)
-    accepted = [p.detach().clone() for p in parameters]
+        first = _restore(saved["fit"], descent, best)
     for i in range(first, config.iterations):
-        state = functools.partial(_state, i, caution, failures, reach, parameters, optimiser, best)
+        state = functools.partial(_state, i, descent, best)
         checkpoint.maybe_save(lambda state=state: {"fit": state()})
-        decay = 0.5 * (1 + math.cos(math.pi * i / config.iterations))
-        for group in optimiser.param_groups:
-            group["lr"] = group["rate"] * caution * (0.05 + 0.95 * decay)
-        optimiser.zero_grad()
+        descent.begin(i / config.iterations)
         passed: list[_Pass] = []
         frames = 0
         try:
             for k, (throw, motion) in enumerate(zip(throws, motions, strict=True)):
-                frames = min(reach, _horizon(i, config.iterations, throw.first_frames, throw.problem.frames))
+                frames = min(descent.reach, _horizon(i, config.iterations, throw.first_frames, throw.problem.frames))
                 departure = torch.zeros(())
                 if isinstance(law, NeuralLaw) and isinstance(start, NeuralLaw) and config.prior_weight:
                     departure = config.prior_weight * law.departure(start)
                 passed.append(
-                    _descend(throw.problem, law, motion, contact, frames, departure, len(throws), (seed, i, k))
+                    _descend(throw.problem, law, motion, contact, frames, departure, 1 / len(throws), (seed, i, k))
                 )
             _keep_better(best, passed, law, motions)
-            if not all(torch.isfinite(p.grad).all() for p in parameters if p.grad is not None):
+            if not descent.finite:
                 raise NonFiniteError(frames * throws[-1].problem.substeps(law), 0, "the adjoint overflowed")
         except NonFiniteError as diverged:
-            failures, caution, reach = failures + 1, caution / 2, max(1, frames - 1)
-            if failures > FAILURES_ALLOWED:
-                raise MasivError(f"identify: the fit keeps diverging ({diverged})") from diverged
-            with torch.no_grad():
-                for parameter, value in zip(parameters, accepted, strict=True):
-                    parameter.copy_(value)
+            descent.failed(frames, diverged)
             continue
-        failures, caution, reach = 0, min(1.0, RECOVERY * caution), min(longest, reach + 1)
-        accepted = [p.detach().clone() for p in parameters]
         frames, error = max(p.frames for p in passed), mean(p.error for p in passed)
         best.history.append((i, frames, error, mean(p.outline for p in passed)))
-        for group in optimiser.param_groups:
-            torch.nn.utils.clip_grad_norm_(group["params"], 1.0)
-        optimiser.step()
-        with torch.no_grad():
-            for motion in motions:
-                motion.ground_offset.clamp_(-config.ground_range, config.ground_range)
+        descent.step()
         progress("identify: fit", i + 1, config.iterations, f"{1e3 * error:.1f} mm over {frames} frames")
     if math.isinf(best.objective):  # no step reached the last frame
-        with torch.no_grad():
-            for parameter, value in zip(parameters, accepted, strict=True):
-                parameter.copy_(value)
-            whole = []
-            for throw, motion in zip(throws, motions, strict=True):
-                problem = throw.problem
-                positions = problem.run(law, motion, contact, problem.frames)
-                whole.append(_Pass(problem.frames, float(problem.error(positions)), 0.0, objective(problem, positions)))
-            _keep_better(best, whole, law, motions)
+        descent.take_back()
+        _keep_better(best, [_whole(*one, law, contact) for one in zip(throws, motions, strict=True)], law, motions)
     return best
 
 
@@ -166,6 +126,14 @@ def _descend(
     here = objective(problem, positions) if frames == problem.frames else None
     (share * loss).backward()
     return _Pass(frames, float(error.detach()), float(outline.detach()), here)
+
+
+@torch.no_grad()
+def _whole(throw: Throw, motion: Motion, law: NeuralLaw | AdapterLaw, contact: str) -> _Pass:
+    """A rollout over all frames."""
+    problem = throw.problem
+    positions = problem.run(law, motion, contact, problem.frames)
+    return _Pass(problem.frames, float(problem.error(positions)), 0.0, objective(problem, positions))
 
 
 def _copied(motions: Sequence[Motion]) -> tuple[Motion, ...]:
@@ -224,25 +192,15 @@ def fit_from(state: dict, law: NeuralLaw | AdapterLaw) -> Fit:
     return Fit(law, motions, state["error_m"], state["objective"], rows)
 
 
-def _state(iteration, caution, failures, reach, parameters, optimiser, best: Fit) -> dict:
-    return {
-        "iteration": iteration,
-        "caution": caution,
-        "failures": failures,
-        "reach": reach,
-        "parameters": [p.detach() for p in parameters],
-        "optimiser": optimiser.state_dict(),
-        "best": fit_state(best),
-    }
+def _state(iteration: int, descent: Descent, best: Fit) -> dict[str, Any]:
+    return {"iteration": iteration, **descent.state(), "best": fit_state(best)}
 
 
-def _restore(state: dict, parameters, optimiser, best: Fit) -> tuple[int, float, int, int]:
-    with torch.no_grad():
-        for parameter, value in zip(parameters, state["parameters"], strict=True):
-            parameter.copy_(value)
-    optimiser.load_state_dict(state["optimiser"])
+def _restore(state: dict[str, Any], descent: Descent, best: Fit) -> int:
+    """The iteration that ``descent`` and ``best`` go on with."""
     kept = fit_from(state["best"], best.law)
+    descent.restore(state)
     best.motions, best.error_m, best.objective, best.history = (
         kept.motions, kept.error_m, kept.objective, kept.history
     )  # fmt: skip
-    return state["iteration"], state["caution"], state["failures"], state["reach"]
+    return state["iteration"]

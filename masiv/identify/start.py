@@ -25,6 +25,8 @@ from masiv.workers import Workers, demanded
 MODULI = (3e3, 1e4, 3e4, 1e5, 3e5)
 """P-wave moduli tried [Pa at 1000 kg/m^3]: waves of 1.7 to 17 m/s, from what sags at once to what hardly deforms in a
 throw."""
+STIFFEST = 10 * MODULI[-1]
+"""No start is stiffer: a motion without a blow tells nothing from there on, and the substeps would be too many."""
 FLUID = "honey"
 """A viscous fluid, which needs no teaching: constants. (The pretrained water has no viscosity.)"""
 SEARCHED = {"jelly": (0.5, 0, 0, 0), FLUID: (0.5, 0, 0, 0.7), "sand": (0.5, 0.7, 0, 0)}
@@ -151,6 +153,8 @@ def _error(
     problem: Problem, motion: Motion, name: str, contact: str, modulus: float, logs: tuple[float, ...] = ()
 ) -> float:
     scaled = with_scales(_law(name), modulus, logs)
+    if scaled.wave_modulus() > STIFFEST * problem.scene.density / 1000:
+        return DIVERGED
     try:
         return objective(problem, problem.run(scaled, motion, contact, problem.frames))
     except InputError:
