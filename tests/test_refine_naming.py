@@ -44,7 +44,8 @@ def test_the_one_that_explains_most_where_the_others_explain_less():
     assert named() == (None, [])
 
 
-def test_of_causes_that_explain_as_much_the_one_that_predicts_best_and_the_others_beside_it():
+def test_of_causes_that_are_not_told_apart_the_one_that_explains_all_instants_best_and_the_others_beside_it():
+    assert named(trial("quadratic", 1.0, 2.0), trial("linear", 1.1, 1.9)) == ("quadratic", ["linear"])
     assert named(trial("quadratic", 1.0, 5), trial("linear", 1.1, 4)) == ("linear", ["quadratic"])
     assert named(trial("quadratic", 1.0, 3), trial("linear", 1.1, 4), trial("force", 1.15, 9)) == (
         "quadratic", ["linear", "force"]

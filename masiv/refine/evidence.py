@@ -162,6 +162,11 @@ def held_out(fitted: Fitted, experiments: Sequence[Watched]) -> np.ndarray:
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
+def all_instants(fitted: Fitted, experiments: Sequence[Watched]) -> float:
+    """Sum of squares over those of noise and grid, fitted and held-out instants alike."""
+    return sum(float((s / e.sigma**2).sum()) for s, e in zip(fitted.squares, experiments, strict=True))
+
+
 def removed_of(was: np.ndarray, now: np.ndarray) -> float:
     """Share of a root mean square that is gone, of squares before and after."""
     return 1 - math.sqrt(float(now.sum()) / max(float(was.sum()), 1e-300))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from masiv.refine.certainty import told_apart
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import held_out, simplest
+from masiv.refine.evidence import all_instants, simplest
 from masiv.refine.rounds import TELLS_APART, Trial
 from masiv.refine.simulated import Watched
 
@@ -18,7 +18,7 @@ def named(
 
     trials: best first by the information criterion. Of those that pass, the simplest that explains what the best one
     does; and with it, each that is no richer (or so much better that this pays) and explains the motion about as well
-    as the best (``told_apart``). Of all these the one that predicts held-out instants best is named.
+    as the best (``told_apart``). Of all these the one that explains all instants best, fitted and held out, is named.
     """
     passing = [t for t in trials if t.passes]
     fit = simplest([t.fitted for t in passing], experiments)
@@ -35,5 +35,5 @@ def named(
         sigmas = told_apart(best, trial.fitted, experiments)
         if sigmas < config.least_apart if sigmas is not None else gain > -TELLS_APART:
             group.append(trial)
-    first = min(group, key=lambda t: float(held_out(t.fitted, experiments).sum()))
+    first = min(group, key=lambda t: all_instants(t.fitted, experiments))
     return first, [t.candidate.effect for t in group if t is not first]
