@@ -10,6 +10,7 @@ import pytest
 from test_refine import VELOCITY
 from test_workers import small_simulation
 
+from masiv.errors import MasivError
 from masiv.identify.families import FAMILIES
 from masiv.identify.parametric import Parameter
 from masiv.refine import second_look
@@ -288,6 +289,24 @@ def test_first_moments_begin_with_the_throw_of_free_flight():
     begun = simulation.begun({"youngs_modulus": 1e4, "velocity_x@run": 9.0, "linear_drag.rate": 0.5})
     assert begun.pop("velocity_x@run") == pytest.approx(VELOCITY[0], abs=0.3)  # drag acts, too
     assert begun == {"youngs_modulus": 1e4, "linear_drag.rate": 0.5}
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_law_that_few_particles_can_take_finer_grids_can_take_too():
+    (experiment,) = small_simulation()[0].experiments
+
+    def law(modulus):
+        return SimpleNamespace(wave_modulus=lambda: modulus)
+
+    def possible(modulus):
+        try:
+            return experiment.problem.least_substeps(law(modulus)) > 0
+        except MasivError:
+            return False
+
+    stiffest = max(filter(possible, np.geomspace(1e3, 1e8, 200)))
+    needed = [finer.least_substeps(law(stiffest)) for finer in experiment.finer]
+    assert max(needed) > experiment.problem.simulator.max_substeps_per_frame
 
 
 @pytest.mark.usefixtures("taichi")

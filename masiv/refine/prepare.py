@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 
@@ -10,6 +12,7 @@ from masiv.identify.few import well_spread
 from masiv.identify.launch import Launch, estimate_launch
 from masiv.identify.problem import Motion, Problem
 from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.design import grid_spacing
 from masiv.refine.config import RefineConfig
 from masiv.refine.model import Experiment
 from masiv.refine.noise import noise_floor
@@ -23,6 +26,9 @@ LEAST_NOISE = 1e-6
 FINER = (1.0, 0.5)
 """Particles per cell, of the twin's, on the grids that say what another grid may change. Where a body bounces they do
 not come nearer to each other as they get finer, so that one of them is one draw of that error."""
+
+TO_SPARE = 1.25
+"""More particles than few may be faster, too."""
 
 
 def experiment_of(
@@ -45,7 +51,7 @@ def experiment_of(
     chosen, fewest = (well_spread(fitted.positions[0], n) for n in (config.particles, config.search_particles))
     few = Problem(scene, fitted, settings, on_few, chosen=chosen)
     fewer = Problem(scene, fitted, settings, on_fewer, chosen=fewest)
-    finer = tuple(Problem(scene, whole, settings, thinned(simulator, share)) for share in FINER)
+    finer = tuple(Problem(scene, whole, settings, finer_than(few, count, thinned(simulator, share))) for share in FINER)
     problem = Problem(scene, whole, settings, on_few, chosen=chosen)
     problem.targets[: len(few.targets)] = few.targets
     problem.start = few.start
@@ -61,6 +67,14 @@ def experiment_of(
         fewer,
         launch,
     )
+
+
+def finer_than(few: Problem, count: int, simulator: SimulatorConfig) -> SimulatorConfig:
+    """``simulator`` for ``count`` particles of the body of ``few``, with as many more substeps for a law as its finer
+    grid asks for: a law that can be simulated there can be here."""
+    ratio = few.spacing / grid_spacing(few.volume, count, simulator)
+    most = math.ceil(TO_SPARE * max(ratio, 1.0) * few.simulator.max_substeps_per_frame)
+    return simulator.model_copy(update={"max_substeps_per_frame": most})
 
 
 def thinned(simulator: SimulatorConfig, share: float) -> SimulatorConfig:
