@@ -191,6 +191,8 @@ def test_evidence():
     little = fits(1.6, 2.0), fits(1.2, 1.2)
     assert "of what noise" in judged(*little)[0]
     assert judged(*little, adapts=False) == []
+    assert "held-out" in judged(fits(1.6, 2.0), fits(1.4, 1.3), adapts=False)[-1]  # the less, the more held-out again
+    assert judged(fits(2.6, 2.0), fits(1.4, 1.3), adapts=False) == []
     assert "held-out" in judged(fits(1.6, 2.0), fits(1.2, 2.0), adapts=False)[-1]
     # Nothing is plain where the simulation is nowhere as certain as the observation.
     assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]

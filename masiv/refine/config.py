@@ -36,7 +36,7 @@ class RefineConfig(BaseModel):
         description="how far points that are followed in pictures are off, over how far they left a rigid motion",
     )  # fmt: skip
     unexplained: float = Field(
-        2.0, ge=1,
+        1.75, ge=1,
         description="residual, over what noise and grid explain, from which something is missing: a further effect is "
         "looked for, and where none is found, it is called unexplained",
     )  # fmt: skip
@@ -50,6 +50,9 @@ class RefineConfig(BaseModel):
         "motion than noise and grid could change",
     )  # fmt: skip
     decisive_gain: float = Field(0.5, ge=0, le=1, description="the same where it explains next to nothing of that")
+    simple_gain: float = Field(
+        0.25, ge=0, le=1, description="the same for an effect that is one number, where the criterion is clear"
+    )
     decisive: float = Field(
         4.0, ge=1,
         description="variance that an effect must explain, over the noise's, in the phase where the simulation is as "

@@ -127,9 +127,10 @@ def explains_too_little(
     Three kinds of evidence are enough: a part of the held-out error that is the larger (``least_gain`` to
     ``decisive_gain``) the less is explained of what noise and grid could change in the fitted instants; held-out
     instants that do not contradict, and a motion that is plain where the simulation is as certain as the observation
-    (sure: how many sigmas the effect is from none beside a smooth noise, worked out where that decides); or
-    ``least_gain`` of the held-out error, for an effect that cannot adapt to an error of any shape (``adapts`` False: it
-    is one number, and the criterion is clear).
+    (sure: how many sigmas the effect is from none beside a smooth noise, worked out where that decides); or a smaller
+    part of the held-out error (``least_gain`` to ``simple_gain``), for an effect that cannot adapt to an error of any
+    shape (``adapts`` False: it is one number, and the criterion is clear). Not a much smaller one: a body at rest keeps
+    its error, and held-out instants then repeat what the last fitted ones said.
     """
     # Variance that it removes, over that which noise and grid would explain.
     gained = [(b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)]
@@ -140,10 +141,9 @@ def explains_too_little(
     if not len(was):
         return [] if share >= 1 else [little]
     won, removed = was - now, removed_of(was, now)
-    asked = config.least_gain + (config.decisive_gain - config.least_gain) * (1 - min(max(share, 0.0), 1.0))
-    confirmed = share > 0 and won.mean() >= SIMPLER and removed >= asked
-    simple = not adapts and removed >= config.least_gain and share > 0
-    if confirmed or simple:
+    unsure = 1 - min(max(share, 0.0), 1.0)
+    asked = config.least_gain + ((config.decisive_gain if adapts else config.simple_gain) - config.least_gain) * unsure
+    if share > 0 and removed >= asked and (not adapts or won.mean() >= SIMPLER):
         return []
     if fitted.certain is not None and won.mean() > -1 and _plain(fitted.certain, config, sure):
         return []
