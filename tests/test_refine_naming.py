@@ -69,3 +69,6 @@ def test_the_answer_says_what_the_motion_does_not_tell():
     )  # fmt: skip
     assert answer(document | {"accepted": [{"effect": "swirl"}]}) == "effect added: swirl"
     assert answer(document | {"verdict": "nothing missing", "accepted": []}) == "nothing missing"
+    assert answer({"verdict": "unexplained residual", "accepted": [{"effect": "hidden_obstacle"}]}) == (
+        "unexplained residual, beside what was added: hidden obstacle"
+    )  # fmt: skip

@@ -9,7 +9,10 @@ from typing import Any
 def answer(document: Mapping[str, Any]) -> str:
     """The verdict with what was accepted, and where the motion does not tell one cause from others, with these."""
     names = ", ".join(map(_named, document["accepted"]))
-    return f"{document['verdict']}{': ' + names if names else ''}"
+    if not names:
+        return document["verdict"]
+    beside = ", beside what was added" if document["verdict"] == "unexplained residual" else ""
+    return f"{document['verdict']}{beside}: {names}"
 
 
 def _named(entry: Mapping[str, Any]) -> str:
