@@ -2,11 +2,16 @@
 
 A rollout of a few thousand particles gains little from a second thread, and two rollouts in two processes take as
 long as one. A rollout is the same to the bit, wherever it runs.
+
+What a process is given, and what it gives back, are copies. multiprocessing's own pickling would move the memory of
+every torch tensor among them to one place that both processes share, in a thread of its own, under a simulation that
+may be reading it.
 """
 
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -77,12 +82,10 @@ class Workers:
         if self.processes == 1 or len(tasks) == 1:
             yield from (attempt(function, task) for task in tasks)
             return
-        futures = [self._started().submit(attempt, function, task) for task in tasks]
+        futures = [self._submitted(function, task) for task in tasks]
         try:
             for future in futures:
-                with self._dying():
-                    found = future.result()
-                yield found
+                yield self._result(future)
         finally:
             for future in futures:
                 future.cancel()
@@ -92,20 +95,18 @@ class Workers:
         Where there is no other process the task runs then. Raises MasivError where the process has died."""
         if self.processes == 1:
             return lambda: attempt(function, task)
-        future = self._started().submit(attempt, function, task)
+        future = self._submitted(function, task)
+        return lambda: self._result(future)
 
-        def result() -> Any:
-            with self._dying():
-                return future.result()
+    def _submitted(self, function: Callable, task: tuple) -> Any:
+        """The future of ``function(*task)`` in another process."""
+        return self._started().submit(_attempt_copied, pickle.dumps((function, task)))
 
-        return result
-
-    @contextmanager
-    def _dying(self) -> Iterator[None]:
+    def _result(self, future: Any) -> Any:
         from concurrent.futures.process import BrokenProcessPool
 
         try:
-            yield
+            return pickle.loads(future.result())
         except BrokenProcessPool as died:
             raise MasivError(f"a worker process died, of too little memory perhaps: set {self.key} to 1") from died
 
@@ -149,6 +150,11 @@ def _start(arch: str) -> None:
 
 def _nothing() -> None:
     pass
+
+
+def _attempt_copied(pickled: bytes) -> bytes:
+    """``attempt`` in another process."""
+    return pickle.dumps(attempt(*pickle.loads(pickled)))
 
 
 def attempt(function: Callable, task: tuple) -> Any:

@@ -57,6 +57,11 @@ def threads():
     return runtime.threads(), os.environ["OMP_NUM_THREADS"]
 
 
+def raised_by_one(tensor):
+    tensor += 1.0
+    return tensor
+
+
 def quiet(*_):
     pass
 
@@ -71,6 +76,18 @@ class Listening(Workers):
     def map(self, function, tasks):
         self.heard.append(list(tasks))
         return super().map(function, self.heard[-1])
+
+
+def test_a_tensor_is_copied_to_a_process_and_its_memory_stays_where_it_is(two):
+    """A simulation beside may be reading it."""
+    given = torch.zeros(3)
+    place = given.data_ptr()
+    results = [*two.map(raised_by_one, [(given,), (given,)]), two.beside(raised_by_one, (given,))()]
+    assert [r.tolist() for r in results] == [[1.0] * 3] * 3
+    assert given.tolist() == [0.0] * 3
+    assert given.data_ptr() == place
+    assert not given.is_shared()
+    assert not any(r.is_shared() for r in results)
 
 
 def test_results_come_in_order_and_a_failure_is_one_of_them(two):
