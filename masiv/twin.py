@@ -84,10 +84,10 @@ class Twin:
                 "omega": _quantity(_floats(self.omega), "rad/s"),
             },
             "gravity": _quantity(_floats(self.gravity), "m/s^2"),
-            "boundary": {"ground": ground, "contact": self.contact, "friction": self.friction},
+            "boundary": {"ground": ground, "contact": self.contact, "friction": float(self.friction)},
             "body": {"volume": _quantity(self.volume, "m^3"), "density": _quantity(self.density, "kg/m^3")},
             "up": _floats(self.up),
-            "fps": self.fps,
+            "fps": float(self.fps),
             "effects": [_effect_entry(effect) for effect in self.effects],
             "simulator": self.simulator.model_dump(),
             "fit": self.fit,
@@ -136,8 +136,8 @@ def _floats(values: np.ndarray) -> list[float]:
     return [float(v) for v in values]
 
 
-def _quantity(value: Any, unit: str) -> dict[str, Any]:
-    return {"value": value, "unit": unit}
+def _quantity(value: float | list[float], unit: str) -> dict[str, Any]:
+    return {"value": value if isinstance(value, list) else float(value), "unit": unit}  # YAML knows no numpy scalar
 
 
 def _effect_entry(effect: TwinEffect) -> dict[str, Any]:
