@@ -32,7 +32,7 @@ def start(arch: str = "cpu") -> Any:
     if arch not in known:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, where stdout may be for one JSON object
-        # One of Taichi's own passes is half of a kernel's compilation, and LLVM does its work again.
+        # One of Taichi's own passes is half of a kernel's compilation, and LLVM does its work again; see ``adjoint``.
         ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, cfg_optimization=False)
     atexit.register(ti.reset)  # writes the kernel cache, which the next command starts from
     running = ti.lang.impl.current_cfg().arch
@@ -41,6 +41,22 @@ def start(arch: str = "cpu") -> Any:
         raise InputError(f"--arch {arch} is not available on this machine: use --arch cpu")
     _started = arch
     return ti
+
+
+def adjoint(kernel: Any, *arguments: Any) -> None:
+    """Run what Taichi's autodiff makes of ``kernel``.
+
+    It is compiled with the pass that ``start`` turns off: without it, Taichi 1.7.4 loses terms of a derivative in
+    float32, and says nothing (of v / (1 + c |v|) all of that by v).
+    """
+    import taichi as ti
+
+    config = ti.lang.impl.current_cfg()
+    config.cfg_optimization = True
+    try:
+        kernel.grad(*arguments)
+    finally:
+        config.cfg_optimization = False
 
 
 def running_arch() -> str:

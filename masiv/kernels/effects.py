@@ -6,6 +6,7 @@ that no two of them add to the same gradient.
 
 import taichi as ti
 
+from masiv import runtime
 from masiv.kernels.grid import DT, DX, NO_GROUND, momentum_of
 
 
@@ -162,7 +163,7 @@ class NodeKernels:
     def adjoint(self, nodes: int, t: float) -> None:
         """``grid_velocity_bar`` after the effect -> before it, from ``before`` as ``apply`` left it."""
         self.load(nodes)
-        self.pointwise.grad(nodes, t)
+        runtime.adjoint(self.pointwise, nodes, t)
         self.store(nodes)
 
 
@@ -322,5 +323,5 @@ class StressKernels:
     def adjoint(self, s: int, count: int) -> None:
         """``stress_bar`` after the effect -> before it, from ``before`` as ``apply`` left it."""
         self.load(s, count)
-        self.pointwise.grad(count)
+        runtime.adjoint(self.pointwise, count)
         self.store(count)

@@ -2,6 +2,7 @@
 
 import taichi as ti
 
+from masiv import runtime
 from masiv.kernels import tensor
 
 
@@ -76,7 +77,7 @@ class ClassicalKernels:
 
     def backward(self, s: int, count: int) -> None:
         self.load_adjoint(s, count)
-        self.pointwise.grad(count)
+        runtime.adjoint(self.pointwise, count)
         self.store_adjoint(count)
 
 
