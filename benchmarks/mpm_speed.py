@@ -74,6 +74,7 @@ def time_plain(count, repeats, arch):
 
     began = time.perf_counter()
     ti = runtime.start(arch)
+    ti.lang.impl.current_cfg().cfg_optimization = True  # as Taichi has it, whose derivatives need it
     sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
     from mpm_plain import PlainMpm
 
