@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 SUDDEN = 4.0
 """How much farther than in the frames before a body is from rigid when it has hit something."""
+LARGEST_TURN = 0.05
+"""[rad], in a step of a turn that is worked out."""
 
 
 def beyond_rigid(positions: np.ndarray) -> np.ndarray:
@@ -39,23 +44,54 @@ def still_rigid(distances: np.ndarray) -> int:
 
 def free_flight(positions: np.ndarray, times: np.ndarray, gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """velocity (3,) [m/s] of the centroid and omega (3,) [rad/s] at the first of ``times`` (T,) [s] of a body that
-    flies at positions (T, N, 3) [m], T >= 2: least squares on x(t) = c + v t + g t^2 / 2 + exp([omega] t) (x0 - c)."""
+    flies at positions (T, N, 3) [m], T >= 2: least squares on ``flown``."""
     t = times[1:] - times[0]
     centres = positions.mean(1)
     # Fall is known, so that what is left is linear in time; late frames tell more of a velocity: least squares through
     # 0.
     drift = centres[1:] - centres[0] - 0.5 * gravity * t[:, None] ** 2
     arms = positions[0] - centres[0]
-    turns = np.stack(
-        [Rotation.align_vectors(p - c, arms)[0].as_rotvec() for p, c in zip(positions[1:], centres[1:], strict=True)]
-    )
-    return (t[:, None] * drift).sum(0) / (t**2).sum(), (t[:, None] * turns).sum(0) / (t**2).sum()
+    turns = [Rotation.align_vectors(p - c, arms)[0] for p, c in zip(positions[1:], centres[1:], strict=True)]
+    steady = (t[:, None] * np.stack([turn.as_rotvec() for turn in turns])).sum(0) / (t**2).sum()
+
+    def missed(omega: np.ndarray) -> np.ndarray:
+        pairs = zip(turns, turned_freely(positions[0], omega, t), strict=True)
+        return np.concatenate([(seen * due.inv()).as_rotvec() for seen, due in pairs])
+
+    return (t[:, None] * drift).sum(0) / (t**2).sum(), least_squares(missed, steady).x
+
+
+def turned_freely(start: np.ndarray, omega: np.ndarray, times: np.ndarray) -> list[Rotation]:
+    """How a rigid body, its mass even over ``start`` (N, 3) [m], has turned at ``times`` (T,) [s], ascending, after a
+    spin of ``omega`` (3,) [rad/s]: Euler's equations, by the midpoint rule. No torque keeps its angular momentum, not
+    its spin: a long body wobbles."""
+    arms = start - start.mean(0)
+    spread = arms.T @ arms
+    inertia = np.trace(spread) * np.eye(3) - spread
+    inertia += 1e-9 * np.trace(inertia) * np.eye(3)  # of points on a line, about the line
+    inverse, momentum = np.linalg.inv(inertia), inertia @ omega
+    turn, now, out = Rotation.identity(), 0.0, []
+    for time in times:
+        steps = max(1, math.ceil(np.linalg.norm(omega) * (time - now) / LARGEST_TURN))
+        h = (time - now) / steps
+        for _ in range(steps):
+            half = Rotation.from_rotvec(0.5 * h * _spin(turn, inverse, momentum)) * turn
+            turn = Rotation.from_rotvec(h * _spin(half, inverse, momentum)) * turn
+        now = time
+        out.append(turn)
+    return out
+
+
+def _spin(turn: Rotation, inverse: np.ndarray, momentum: np.ndarray) -> np.ndarray:
+    """omega (3,) of a body that has turned, from the inverse of its inertia before that and its angular momentum."""
+    return turn.apply(inverse @ turn.inv().apply(momentum))
 
 
 def flown(start: np.ndarray, velocity: np.ndarray, omega: np.ndarray, gravity: np.ndarray, time: float) -> np.ndarray:
-    """Where points ``start`` (N, 3) [m] of a body are after ``time`` [s] of the flight that ``free_flight`` finds."""
+    """Where points ``start`` (N, 3) [m] of a body, its mass even over them, are after ``time`` [s] of free flight:
+    x(t) = c + v t + g t^2 / 2 + R(t) (x0 - c), R of ``turned_freely``."""
     centre = start.mean(0)
-    turned = Rotation.from_rotvec(omega * time).apply(start - centre)
+    turned = turned_freely(start, omega, np.array([time]))[0].apply(start - centre)
     return centre + velocity * time + 0.5 * gravity * time**2 + turned
 
 
