@@ -39,7 +39,10 @@ class ReconstructConfig(BaseModel):
     scale_rate: float = Field(1e-2, gt=0, description="step of log sizes at first")
     opacity_rate: float = Field(3e-2, gt=0, description="step of opacity logits at first")
     colour_rate: float = Field(2e-2, gt=0, description="step of colour logits at first")
-    followed_rate: float = Field(0.1, gt=0, le=1, description="share of means_rate left once frame 0 is fitted")
+    followed_rate: float = Field(
+        5e-3, gt=0, le=1,
+        description="share of means_rate left once frame 0 is fitted, and of colour_rate while frames come in",
+    )  # fmt: skip
     final_rate: float = Field(0.05, gt=0, le=1, description="share of a step that is left at the end")
 
     ssim_weight: float = Field(0.2, ge=0, le=1, description="of 1 - SSIM; the rest is L1")

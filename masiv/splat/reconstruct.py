@@ -136,9 +136,9 @@ class _Fit:
         rates = dict(zip(NAMES, (c.means_rate * extent, c.scale_rate, c.opacity_rate, c.colour_rate), strict=True))
         self.parameters = {name: value.requires_grad_() for name, value in self.parameters.items()}
         weights = [p for name, p in self.network.named_parameters() if name != "base_motion"]
-        groups = [{"params": [self.parameters[name]], "rate": rates[name]} for name in NAMES]
-        groups += [{"params": weights, "rate": c.motion_rate}]
-        groups += [{"params": [self.network.base_motion], "rate": c.base_rate * extent}]
+        groups = [{"name": name, "params": [self.parameters[name]], "rate": rates[name]} for name in NAMES]
+        groups += [{"name": "weights", "params": weights, "rate": c.motion_rate}]
+        groups += [{"name": "base_motion", "params": [self.network.base_motion], "rate": c.base_rate * extent}]
         self.optimiser = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
         self._find_neighbours()
 
@@ -175,8 +175,11 @@ class _Fit:
         for group in self.optimiser.param_groups:
             group["lr"] = group["rate"] * c.final_rate**self.settling
         if self.frames > 1:
-            # Points that go on sliding over the surface while frames come in would take the motion with them.
-            self.optimiser.param_groups[0]["lr"] *= c.followed_rate
+            # Points that go on sliding over the surface, or colours that pass over them, show what moved as well as
+            # motion does, and faster: a spin would be followed with a lag.
+            for group in self.optimiser.param_groups:
+                if group["name"] == "means" or (group["name"] == "colour_logits" and self.settling == 0):
+                    group["lr"] *= c.followed_rate
         parts = self.objective.parts(len(self.parameters["means"]), pictures, 1 - self.settling, rng)
         value = self._find_slopes(parts)
         if not np.isfinite(value):
