@@ -56,7 +56,7 @@ OUTSIDE = {
 
 def cases():
     """Controls of every material; every effect, strong on an elastic body and weak on another; two at once; unknown;
-    and the other way round, weak on an elastic body and strong on another."""
+    the other way round, weak on an elastic body and strong on another; and a pull that is nothing like uniform."""
     from track_cases import Case
 
     out = []
@@ -81,6 +81,9 @@ def cases():
                 law, parameters = MATERIALS[material]
                 name = f"{effect}_{material}_{word}"
                 out.append(Case(name, law, parameters, {effect: values}, seed=len(out)))
+    law, parameters = ELASTIC
+    near = {"attraction": {"strength": 0.5, "x": 0.45, "y": 0.5, "z": 0.35}}
+    out.append(Case("unknown_attraction_near", law, parameters, {}, seed=len(out), outside=near))
     return sorted(out, key=lambda case: case.law != "neo_hookean" or case.name.endswith("_stiff"))
 
 
