@@ -216,6 +216,7 @@ def main():
     parser.add_argument("--laws", default="", help="families that compete, with commas; the case's own where empty")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of refine")
     parser.add_argument("--per-cell", type=float, default=6.0, help="particles a cell of the truth's grid")
+    parser.add_argument("--draw", type=int, default=0, help="another draw of the noise")
     parser.add_argument("--oracle", action="store_true", help="fit models that were told the effect, instead")
     parser.add_argument("--table")
     parser.add_argument("--oracles", help="with --table: the file that --oracle wrote")
@@ -237,7 +238,7 @@ def main():
         laws = [n for n in options.laws.split(",") if n] or [case.law]
         settings = {"particles": options.particles, "laws": laws}
         settings |= {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in options.set)}
-        case = dataclasses.replace(case, per_cell=options.per_cell)
+        case = dataclasses.replace(case, per_cell=options.per_cell, seed=case.seed + 1000 * options.draw)
         row = (told_of if options.oracle else refined)(case, RefineConfig.model_validate(settings))
         with out.open("a") as file:
             file.write(json.dumps(row) + "\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
@@ -16,7 +17,7 @@ from masiv.identify.parametric import Parameter
 from masiv.refine import second_look
 from masiv.refine.add_effect import absent
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import excess, explains_too_little, sigmas_from_zero, simplest
+from masiv.refine.evidence import excess, explains_too_little, foretold, objections, sigmas_from_zero, simplest
 from masiv.refine.grids import weighed, with_grid_errors
 from masiv.refine.loop import in_reach
 from masiv.refine.model import Model, Simulation
@@ -196,6 +197,27 @@ def test_evidence():
     assert "held-out" in judged(fits(1.6, 2.0), fits(1.2, 2.0), adapts=False)[-1]
     # Nothing is plain where the simulation is nowhere as certain as the observation.
     assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]
+
+
+def test_held_out_instants_are_one_sample_of_the_criterion():
+    experiments = [Watched(sigma=np.full(INSTANTS, NOISE))]
+    assert foretold(fits(2, 6), fits(1, 2), experiments) == pytest.approx(math.log(3))
+    assert foretold(fits(2, 6), fits(1, 0.1), experiments) == pytest.approx(math.log(6))  # noise alone is not foretold
+    assert foretold(fits(2, 2), fits(1, 6), experiments) == pytest.approx(-math.log(3))
+    assert foretold(fits(2, 6), fits(1, 2), [replace(experiments[0], holds_out=False)]) == 0.0
+    rate = Parameter("linear_drag.rate", 0.1, 0.0, 10.0, 0.1)
+    term = Term("linear_drag", "linear_drag", (rate,), (), ((),), {})
+
+    def objected(gain, was, now):
+        before, after = fits(9, was), fits(1, now)
+        for found, criterion in ((before, 0.0), (after, -gain)):
+            found.bic, found.samples, found.jacobian = lambda samples, c=criterion: c, 100, np.ones((4, 1))
+            found.parameters, found.values, found.stderr = [rate], {rate.name: 1.0}, {rate.name: 0.1}
+        return " ".join(objections(before, after, term, experiments, RefineConfig.model_validate({})))
+
+    assert objected(5.4, 6, 2) == ""
+    assert "falls by 5.5, less than 6" in objected(5.4, 2.2, 2)
+    assert "falls by 5.9, less than 6" in objected(7.0, 2, 6)
 
 
 def test_a_second_cause_is_confirmed_and_both_are_certain():

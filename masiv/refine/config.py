@@ -64,8 +64,8 @@ class RefineConfig(BaseModel):
     )  # fmt: skip
     least_bic: float = Field(
         6.0, ge=0,
-        description="how far an effect must lower the information criterion; from 6 on evidence is called strong (Kass "
-        "and Raftery, JASA 90, 1995), and held-out frames are asked besides",
+        description="how far an effect must lower the information criterion, to which held-out frames are one sample "
+        "more; from 6 on evidence is called strong (Kass and Raftery, JASA 90, 1995)",
     )  # fmt: skip
     clear_bic: float = Field(
         20.0, ge=0,

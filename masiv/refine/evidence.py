@@ -75,8 +75,9 @@ def objections(
     """Why ``term`` is not accepted; empty where it is."""
     out = []
     gain = before.bic(after.samples) - after.bic(after.samples)
-    if gain < config.least_bic:
-        out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
+    whole = gain + foretold(before, after, experiments)
+    if whole < config.least_bic:
+        out.append(f"the information criterion falls by {whole:.1f}, less than {config.least_bic:g}")
     adapts = len(term.parameters) > 1 or gain < config.clear_bic
     out += explains_too_little(
         before, after, experiments, config, adapts=adapts, sure=lambda: certainty(after, term, experiments)
@@ -160,6 +161,18 @@ def held_out(fitted: Fitted, experiments: Sequence[Watched]) -> np.ndarray:
         (squares / e.sigma**2)[e.rows :] for squares, e in zip(fitted.squares, experiments, strict=True) if e.holds_out
     ]
     return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def foretold(before: Fitted, after: Fitted, experiments: Sequence[Watched]) -> float:
+    """By how much more the information criterion falls for what no fit saw (Dawid's prequential likelihood, J. R. Stat.
+    Soc. A 147, 1984). The held-out instants of an experiment are one sample, since they share one error that grows; of
+    an error within noise and grid there is nothing to foretell."""
+    out = 0.0
+    for was, now, e in zip(before.squares, after.squares, experiments, strict=True):
+        if e.holds_out:
+            was, now = (max(float((s / e.sigma**2)[e.rows :].mean()), 1.0) for s in (was, now))
+            out += math.log(was / now)
+    return out
 
 
 def all_instants(fitted: Fitted, experiments: Sequence[Watched]) -> float:
