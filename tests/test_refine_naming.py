@@ -62,6 +62,16 @@ def test_a_cause_is_no_rival_of_itself_beside_another_law():
     assert named(trial("drag", 1.0, 5), trial("drag", 1.05, 4)) == ("drag", [])
 
 
+def test_the_law_is_the_simplest_that_foretells_the_motion():
+    def law(*trials):
+        return len(naming.named(trials, WATCHED, RefineConfig())[0].fitted.values)
+
+    # Of the same cause, over the fitted instants as good: plastic, and viscous with a parameter less.
+    assert law(trial("wind", 1.0, 2.0), trial("wind", 1.2, 2.2, count=8)) == 8
+    assert law(trial("wind", 1.0, 2.0), trial("wind", 1.2, 9.0, count=8)) == 9
+    assert law(trial("wind", 1.0, 9.0), trial("wind", 1.2, 2.0, count=8)) == 8
+
+
 def test_the_answer_says_what_the_motion_does_not_tell():
     document = {"verdict": "effect added", "accepted": [{"effect": "linear_drag", "or_else": ["quadratic_drag"]}]}
     assert answer(document) == (

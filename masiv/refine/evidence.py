@@ -58,13 +58,16 @@ def above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineCo
     return math.sqrt(float(squares.mean())) > config.above_noise or not foretold
 
 
-def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched]) -> Fitted | None:
+def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched], *, foretelling: bool = False) -> Fitted | None:
     """Of fits, best first, the one with the fewest parameters (those held at a guess included) that explains what the
-    best one does, but for less than noise and grid could change."""
+    best one does, but for less than noise and grid could change. foretelling: held-out instants, too."""
 
     def lacks(fitted: Fitted) -> float:
         squares = zip(fitted.squares, passing[0].squares, experiments, strict=True)
-        return phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments).largest
+        largest = phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments).largest
+        if not foretelling or not any(e.holds_out for e in experiments):
+            return largest
+        return max(largest, float((held_out(fitted, experiments) - held_out(passing[0], experiments)).mean()))
 
     return min((f for f in passing if lacks(f) < SIMPLER), key=lambda f: len(f.values), default=None)
 

@@ -18,7 +18,8 @@ def named(
 
     trials: best first by the information criterion. Of those that pass, the simplest that explains what the best one
     does; and with it, each that is no richer (or so much better that this pays) and explains the motion about as well
-    as the best (``told_apart``). Of all these the one that explains all instants best, fitted and held out, is named.
+    as the best (``told_apart``). Of all these the one that explains all instants best, fitted and held out, is named,
+    beside the simplest law that foretells about as well as the best of its laws does.
     """
     passing = [t for t in trials if t.passes]
     fit = simplest([t.fitted for t in passing], experiments)
@@ -36,4 +37,7 @@ def named(
         if sigmas < config.least_apart if sigmas is not None else gain > -TELLS_APART:
             group.append(trial)
     first = min(group, key=lambda t: all_instants(t.fitted, experiments))
-    return first, [t.candidate.effect for t in group if t is not first]
+    of_it = [t for t in passing if t.candidate.effect == first.candidate.effect]
+    of_it.sort(key=lambda t: all_instants(t.fitted, experiments))
+    law = simplest([t.fitted for t in of_it], experiments, foretelling=True)
+    return next(t for t in of_it if t.fitted is law), [t.candidate.effect for t in group if t is not first]
