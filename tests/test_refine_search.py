@@ -82,6 +82,29 @@ def test_what_is_simpler_or_has_a_kink_is_fitted_again_from_where_the_best_ended
     assert [t.fitted.cost for t in trials] == [1.0, 2.0, 0.5, 2.0]
 
 
+@pytest.mark.parametrize(
+    ("best", "ends", "kept"),
+    [
+        (0.1, 0.12, 0.12),  # it was a minimum that was none
+        (0.1, 1.5, 1.0),  # the cause did help
+        (0.6, 0.1, 1.0),  # which is not asked where it helped little
+    ],
+)
+def test_what_an_effect_helped_out_of_is_left_without_it(best, ends, kept, monkeypatch):
+    begun = []
+
+    def full_fit(simulation, model, values, **_):
+        begun.append(values)
+        return fit("ground_height", cost=ends)
+
+    monkeypatch.setattr(loop, "full_fit", full_fit)
+    monkeypatch.setattr(loop, "held_in", lambda *_: frozenset())
+    base, richer = fit("ground_height"), fit("ground_height", "point_mass", cost=best)
+    base.values, richer.values = {"height": 0.1, "offset": 3.0}, {"height": 0.2, "mass": 5.0}
+    assert loop._escaped(Library(), base, richer, 1.0).cost == kept
+    assert begun == ([{"height": 0.2, "offset": 3.0}] if best < 0.5 else [])
+
+
 @pytest.mark.parametrize(("left", "fitted"), [(1.1, ["0", "1"]), (1.3, ["0", "1", "2", "3"])])
 def test_more_causes_are_fitted_while_much_is_left(left, fitted, monkeypatch):
     """A cause that acts at a place may be far down in a linear ranking: of five that explain something, in twos."""

@@ -26,6 +26,8 @@ Say = Callable[[str, int, int, str], None]
 STOP_GAP = "smooth_force"
 SOFT = 5.0
 """Sizes of the noise from which a weighted residual counts as wild, at the least."""
+ESCAPE = 0.5
+"""Share of a model's cost from which one with an effect more may have got out of a minimum that is none."""
 MISJUDGED = 1.5
 """By how much a ranking, which is linear, may have judged a cause too small."""
 
@@ -61,6 +63,7 @@ def close_loop(
         done = _round(simulation, current, rivals, soft, config, say, workers)
         rounds.append(done)
         if done.accepted is None:
+            current = done.base
             break
         current = done.accepted.fitted
         look = config.second_look and len(rounds) < config.max_effects
@@ -173,6 +176,8 @@ def _round(
     if trials:
         _second_chance(simulation, trials, soft, say, workers)
         _rank(trials)
+        if current.model.effects:
+            current = _escaped(simulation, current, trials[0].fitted, soft)
     alike = confusable(ranking, trials, config.confusable)
     accepted = None
     for trial in trials:
@@ -262,6 +267,21 @@ def _second_chance(simulation: Simulated, trials: Sequence[Trial], soft: float, 
         say("refine: fit simpler effects again", done + 1, len(simpler), trial.candidate.effect)
         if not isinstance(again, Failed):
             trial.fitted = min(again, trial.fitted, key=lambda f: f.cost)
+
+
+def _escaped(simulation: Simulated, base: Fitted, best: Fitted, soft: float) -> Fitted:
+    """``base``, or where it ends from what it shares with ``best``, a model with one more effect: where a body meets an
+    obstacle there are minima that are none, and what helps out of one is no cause."""
+    if best.cost > ESCAPE * base.cost:
+        return base
+    values = {n: best.values.get(n, value) for n, value in base.values.items()}
+    try:
+        again = full_fit(
+            simulation, base.model, values, budget=2 * (len(values) + 2), soft=soft, held=held_in(simulation, base)
+        )
+    except MasivError:
+        return base
+    return min(base, again, key=lambda f: f.cost)
 
 
 def _fitted_from(simulation: Simulated, fitted: Fitted, name: str, best: Fitted, soft: float) -> Fitted:
