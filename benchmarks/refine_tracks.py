@@ -198,10 +198,11 @@ def table(path, oracles):
 
 
 def judged(row):
-    """What the answer is worth: a control that is left alone is named, too, and so is an effect of no library."""
+    """What the answer is worth: a control that is left alone is named, too, and so is an effect of no library that is
+    called unexplained."""
     true, found = set(row["true"]), set(row["accepted"])
     others = {other for names in row["or_else"].values() for other in names}
-    if found == true or (not found and not true <= STRENGTHS.keys()):
+    if found == true or (row["verdict"] == "unexplained residual" and not true <= STRENGTHS.keys()):
         return "named, with others beside it" if others else "named"
     if not found:
         return "abstained"
