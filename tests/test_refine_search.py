@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from masiv.identify.parametric import Parameter
@@ -80,6 +81,30 @@ def test_what_is_simpler_or_has_a_kink_is_fitted_again_from_where_the_best_ended
     loop._second_chance(Library(), trials, 1.0, lambda *_: None, Workers())
     assert again == ["restitution"]
     assert [t.fitted.cost for t in trials] == [1.0, 2.0, 0.5, 2.0]
+
+
+@pytest.mark.parametrize(("foretold", "first"), [(9.0, "neo_hookean"), (2.0, "von_mises")])
+def test_residuals_are_weighed_by_the_law_that_foretells_the_motion(foretold, first, monkeypatch):
+    """A plastic law fits a viscous body's first frames best; whether it is the base, the frames after them say."""
+    noise, weighed = 1e-3, []
+
+    def law(kind, fitted, held_out):
+        found = fit(cost=fitted * noise**2)
+        found.model = SimpleNamespace(family=SimpleNamespace(kind=kind), effects=())
+        found.squares, found.values = [noise**2 * np.array([fitted, fitted, held_out])], {}
+        return found
+
+    baselines = [law("von_mises", 1.0, foretold), law("neo_hookean", 1.9, 3.0)]
+    simulation = Library()
+    simulation.experiments = (
+        SimpleNamespace(sigma=np.full(3, noise), noise=noise, rows=2, holds_out=True, instants=3),
+    )  # fmt: skip
+    simulation.residual = lambda model, values: np.full(8, noise)
+    monkeypatch.setattr(loop, "weigh", lambda _, fitted, __: weighed.append(fitted.model.family.kind))
+    monkeypatch.setattr(loop, "side_by_side", lambda *_: iter(baselines))
+    rivals, _ = loop._weighed_baselines(simulation, baselines, [], RefineConfig(), lambda *_: None, Workers())
+    assert [f.model.family.kind for f in rivals] == sorted(["neo_hookean", "von_mises"], key=lambda k: k != first)
+    assert weighed == (["von_mises"] if first == "von_mises" else ["von_mises", "neo_hookean"])
 
 
 @pytest.mark.parametrize(

@@ -58,14 +58,14 @@ def above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineCo
     return math.sqrt(float(squares.mean())) > config.above_noise or not foretold
 
 
-def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched], *, foretelling: bool = False) -> Fitted | None:
+def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched], *, whole: bool = False) -> Fitted | None:
     """Of fits, best first, the one with the fewest parameters (those held at a guess included) that explains what the
-    best one does, but for less than noise and grid could change. foretelling: held-out instants, too."""
+    best one does, but for less than noise and grid could change. whole: of the held-out instants, too."""
 
     def lacks(fitted: Fitted) -> float:
         squares = zip(fitted.squares, passing[0].squares, experiments, strict=True)
         largest = phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments).largest
-        if not foretelling or not any(e.holds_out for e in experiments):
+        if not whole or not any(e.holds_out for e in experiments):
             return largest
         return max(largest, float((held_out(fitted, experiments) - held_out(passing[0], experiments)).mean()))
 
@@ -181,6 +181,12 @@ def foretold(before: Fitted, after: Fitted, experiments: Sequence[Watched]) -> f
 def all_instants(fitted: Fitted, experiments: Sequence[Watched]) -> float:
     """Sum of squares over those of noise and grid, fitted and held-out instants alike."""
     return sum(float((s / e.sigma**2).sum()) for s, e in zip(fitted.squares, experiments, strict=True))
+
+
+def foretelling(fits: Sequence[Fitted], experiments: Sequence[Watched]) -> Fitted:
+    """Of fits of several laws, the simplest that explains fitted and held-out instants about as well as the best."""
+    best_first = sorted(fits, key=lambda f: all_instants(f, experiments))
+    return simplest(best_first, experiments, whole=True) or best_first[0]
 
 
 def removed_of(was: np.ndarray, now: np.ndarray) -> float:

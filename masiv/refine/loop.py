@@ -11,7 +11,7 @@ import numpy as np
 from masiv.errors import MasivError
 from masiv.refine.add_effect import CHORD_STEPS, refit
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import above_noise, excess, objections
+from masiv.refine.evidence import above_noise, excess, foretelling, objections
 from masiv.refine.grids import weighed, with_grid_errors
 from masiv.refine.naming import named
 from masiv.refine.refit import Fitted, carried, full_fit, held_in, ordered, reweighted, softness, strengths_alone
@@ -49,14 +49,8 @@ def close_loop(
     """Add effects to the best of ``baselines`` (one a law, without effects) until none is confirmed, or the residual is
     near the noise. Gives the experiments of ``simulation`` their sigma, and ``workers`` what need not wait."""
     workers = workers or Workers()
-    least = min(baselines, key=lambda f: f.cost)
     observation = [e.sigma for e in simulation.experiments]
-    weigh(simulation, least, observation)
-    soft = max(softness(simulation.residual(least.model, least.values)), SOFT * simulation.experiments[0].noise)
-    say("refine: weigh", 0, 1, "")
-    again = side_by_side(workers, simulation, reweighted, [(base, CHORD_STEPS, soft) for base in baselines])
-    rivals = ordered([demanded(fitted) for fitted in again])[: config.families]
-    say("refine: weigh", 1, 1, "")
+    rivals, soft = _weighed_baselines(simulation, baselines, observation, config, say, workers)
     before = current = rivals[0]
     rounds: list[Round] = []
     while len(rounds) < config.max_effects and above_noise(current, simulation.experiments, config):
@@ -92,6 +86,34 @@ def close_loop(
         gap = stop_gap(simulation, current, soft, config, say)
     known = with_grid_errors(simulation, current, soft)
     return Outcome(known if current is before else before, known, rounds, gap)
+
+
+def _weighed_baselines(
+    simulation: Simulated,
+    baselines: Sequence[Fitted],
+    observation: Sequence[np.ndarray],
+    config: RefineConfig,
+    say: Say,
+    workers: Workers,
+) -> tuple[list[Fitted], float]:
+    """The best of ``baselines``, fitted again with sigma as the first of them moves; and the size from which residuals
+    are wild. That one is the simplest that foretells the motion, since a law that takes an effect over where it is
+    fitted is found out there; the others are ordered by the information criterion."""
+    first = min(baselines, key=lambda f: f.cost)
+    rivals, soft = [first], 0.0
+    for _ in range(2):  # the one that is nearest before sigma is known may not be it
+        weigh(simulation, first, observation)
+        soft = max(softness(simulation.residual(first.model, first.values)), SOFT * simulation.experiments[0].noise)
+        say("refine: weigh", 0, 1, "")
+        again = side_by_side(workers, simulation, reweighted, [(base, CHORD_STEPS, soft) for base in baselines])
+        rivals = ordered([demanded(fitted) for fitted in again])[: config.families]
+        say("refine: weigh", 1, 1, "")
+        best = foretelling(rivals, simulation.experiments)
+        rivals.sort(key=lambda f, best=best: f is not best)
+        if best.model == first.model:
+            break
+        first = best
+    return rivals, soft
 
 
 def _told_apart(current: Fitted, first: Round, looks: Sequence[Round]) -> Fitted:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from masiv.refine.certainty import told_apart
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import all_instants, simplest
+from masiv.refine.evidence import all_instants, foretelling, simplest
 from masiv.refine.rounds import TELLS_APART, Trial
 from masiv.refine.simulated import Watched
 
@@ -38,6 +38,5 @@ def named(
             group.append(trial)
     first = min(group, key=lambda t: all_instants(t.fitted, experiments))
     of_it = [t for t in passing if t.candidate.effect == first.candidate.effect]
-    of_it.sort(key=lambda t: all_instants(t.fitted, experiments))
-    law = simplest([t.fitted for t in of_it], experiments, foretelling=True)
+    law = foretelling([t.fitted for t in of_it], experiments)
     return next(t for t in of_it if t.fitted is law), [t.candidate.effect for t in group if t is not first]
