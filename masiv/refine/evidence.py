@@ -54,8 +54,8 @@ def above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineCo
     ones above what noise and grid explain: what a law and a throw make up for at first shows there."""
     squares = np.concatenate([(s / e.noise**2)[: e.rows] for s, e in zip(fitted.squares, experiments, strict=True)])
     rest = held_out(fitted, experiments)
-    foretold = not len(rest) or math.sqrt(float(rest.mean())) <= config.unexplained
-    return math.sqrt(float(squares.mean())) > config.above_noise or not foretold
+    explained = not len(rest) or math.sqrt(float(rest.mean())) <= config.unexplained
+    return math.sqrt(float(squares.mean())) > config.above_noise or not explained
 
 
 def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched], *, whole: bool = False) -> Fitted | None:
@@ -78,9 +78,9 @@ def objections(
     """Why ``term`` is not accepted; empty where it is."""
     out = []
     gain = before.bic(after.samples) - after.bic(after.samples)
-    whole = gain + foretold(before, after, experiments)
-    if whole < config.least_bic:
-        out.append(f"the information criterion falls by {whole:.1f}, less than {config.least_bic:g}")
+    fall = gain + foretold(before, after, experiments)
+    if fall < config.least_bic:
+        out.append(f"the information criterion falls by {fall:.1f}, less than {config.least_bic:g}")
     adapts = len(term.parameters) > 1 or gain < config.clear_bic
     out += explains_too_little(
         before, after, experiments, config, adapts=adapts, sure=lambda: certainty(after, term, experiments)
