@@ -24,7 +24,7 @@ import torch
 from masiv import runtime
 from masiv.effects._walls import walled
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import Setting
+from masiv.effects.effect import EffectContext
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import substeps_per_frame
@@ -80,7 +80,9 @@ def collapse(
         density=DENSITY, gravity=(0.0, -GRAVITY, 0.0), contact=floor, memory_mb=200, max_substeps=64,
         grid_nodes=1 << (17 if cells <= 20 else 19), chunks=1,
     )  # fmt: skip
-    setting = Setting(torch.tensor([0.0, -GRAVITY, 0.0]), x, DENSITY * gap * gap * gap, height, until * to_seconds)
+    setting = EffectContext(
+        torch.tensor([0.0, -GRAVITY, 0.0]), x, DENSITY * gap * gap * gap, height, until * to_seconds
+    )
     planes = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # the wall; and nothing moves along z
     effects = walled(ActiveEffects((), setting), planes, torch.tensor([0.0, 1e3]))
     state = at_rest(x, torch.zeros_like(x), torch.zeros(len(x), 3, 3))

@@ -21,8 +21,8 @@ from scipy.optimize import brentq, least_squares
 
 from masiv import runtime
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.marker_body import plan, simulated_body, simulated_markers
 from masiv.mpm.config import SimulatorConfig
-from masiv.tracks.body import plan, simulated_body, simulated_markers
 from masiv.tracks.declaration import GeometryDeclaration
 from masiv.tracks.geometry import make_geometry
 from masiv.tracks.placement import Placement

@@ -29,8 +29,8 @@ def main():
     from masiv.config import load_config
     from masiv.identify.stage import identify, relearn
     from masiv.materials.classical import ClassicalLaw
+    from masiv.observations.motion import SampledMotion
     from masiv.refine.config import RefineConfig
-    from masiv.refine.observed import SampledMotion
     from masiv.refine.stage import Throw, refine, twin_of
     from masiv.refine.summary import summary
 
@@ -56,7 +56,7 @@ def main():
     found = refine([throw], config, settings.simulator, wanted, progress=quiet)
     document = summary(found, wanted, dry_run=False)
     print("refine:", document["verdict"], [(a["effect"], a["theta"], a["stderr"]) for a in document["accepted"]])
-    refined = twin_of(found.outcome.after, throw, found.simulation, twin)
+    refined = twin_of(found.result.after, throw, found.simulation, twin)
     laws["drag, refine's classical law"] = refined.law
     again = relearn(refined, seen, fitted, config, seed=0, progress=quiet)
     laws["drag, learnt anew beside the effect"] = again.law
@@ -88,7 +88,7 @@ def gone_through(twin):
     """Elastic deformation gradients (M, 3, 3) of all particles at the fitted frames."""
     import torch
 
-    from masiv.mpm.simulate import march
+    from masiv.simulation.simulate import march
 
     return torch.cat([state.trial_gradient for state in march(twin, frames=FRAMES, fps=twin.fps)])
 

@@ -32,18 +32,18 @@ from parameters import FAMILY, true_parameters
 
 from masiv.cli import stages
 from masiv.continuum.trajectory import Trajectory
-from masiv.identify.launch import estimate_launch
 from masiv.identify.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.metrics import chamfer_floor
+from masiv.models.initial_motion import estimate_initial_motion
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing
-from masiv.mpm.simulate import simulate
+from masiv.observations.read import read_scene
 from masiv.report.measure import motion_numbers, read_truth
 from masiv.report.numbers import twin_numbers
 from masiv.runfolder import RunFolder
-from masiv.scene.read import read_scene
 from masiv.scene.scene import Scene
+from masiv.simulation.simulate import simulate
 from masiv.twin import Twin
 
 KEPT = ("gaussians.ply", "deformation.safetensors", "trajectory.npz")
@@ -187,20 +187,22 @@ def said(stage: str, done: int, total: int, note: str = "") -> None:
         print(f"  {stage} {done}/{total} {note}", file=sys.stderr, flush=True)
 
 
-def unseen(twin: Twin, other: Path, scene: Path) -> dict[str, Any]:
+def identifiability_issue(twin: Twin, other: Path, scene: Path) -> dict[str, Any]:
     """The law of ``twin`` on another throw, of which run ``other`` gives the body and, from its free flight alone, the
     velocity and spin: no frame after the first contact is looked at. Ground and contact are those of ``twin``."""
     run, read = RunFolder.open(other), read_scene(scene)
     trajectory = stages.load_trajectory(run)
     spacing = grid_spacing(trajectory.volume, trajectory.positions.shape[1], twin.simulator)
-    launch = estimate_launch(trajectory.positions, trajectory.times, read.gravity, read.ground, clearance=spacing)
-    thrown = dataclasses.replace(
-        twin, positions=trajectory.positions[0], volume=trajectory.volume, velocity=launch.velocity,
-        omega=launch.omega,
+    initial_motion = estimate_initial_motion(
+        trajectory.positions, trajectory.times, read.gravity, read.ground, clearance=spacing
+    )
+    rigid_initial_state = dataclasses.replace(
+        twin, positions=trajectory.positions[0], volume=trajectory.volume, velocity=initial_motion.velocity,
+        omega=initial_motion.omega,
     )  # fmt: skip
-    motion = simulate(thrown, frames=read.frame_count, fps=read.fps).positions
+    motion = simulate(rigid_initial_state, frames=read.frame_count, fps=read.fps).positions
     truth = read_truth(scene / "gt", read.frame_count)
-    after = range(launch.last_frame + 1, read.frame_count)
+    after = range(initial_motion.last_frame + 1, read.frame_count)
     return {"after contact": motion_numbers(motion, truth, after), "floor": floor(truth)}
 
 
@@ -236,12 +238,12 @@ def main() -> None:
             base = base_run(case, o.out, o.preset, o.fit_frames)
             keep(results, rows, {"case": key, "preset": o.preset, **fit(case, base, o.out, o.preset, o.fit_frames)})
             print(f"{key}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
-        for other in o.unseen:
+        for other in o.identifiability_issue:
             key = f"{scene.name}/{case.name} on {other.name}"
             if key not in done:
                 base = base_run(dataclasses.replace(case, scene=other), o.out, o.preset, o.fit_frames)
                 learnt = Twin.load(o.out / scene.name / case.name)
-                found = unseen(learnt, base, other)
+                found = identifiability_issue(learnt, base, other)
                 keep(results, rows, {
                     "case": key, "what": "unseen", "scene": scene.name, "law": law, "fitted": learnt.law.kind,
                     "on": other.name, "seed": seed, "settings": list(case.settings),

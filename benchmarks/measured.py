@@ -109,49 +109,49 @@ def ball_scene(source: Path):
 
 def balls(source: Path) -> dict:
     """What refine finds in the ball drops, and what one free gravity a ball would have looked like."""
+    from masiv.inference.model_fit import gauss_newton_fit
+    from masiv.models.free_body import Model
     from masiv.refine.config import RefineConfig
-    from masiv.refine.model import Model
-    from masiv.refine.refit import full_fit
-    from masiv.tracks.group import refine_group, unlike
+    from masiv.refine.pooling import refine_group, unlike
 
     tracks = ball_scene(source)
     began = time.perf_counter()
     found = refine_group(tracks, "balls", RefineConfig.model_validate({}))
     seconds = time.perf_counter() - began
-    simulation, outcome = found.simulation, found.outcome
-    first = {t.candidate.effect: t for t in outcome.rounds[0].trials}
+    simulation, result = found.simulation, found.result
+    first = {t.candidate.effect: t for t in result.rounds[0].trials}
     alike = simulation.by_body
     rows = {
-        "before": alike(outcome.before.model, outcome.before.values, fitted=False),
-        "after": alike(outcome.after.model, outcome.after.values, fitted=False),
+        "before": alike(result.before.model, result.before.values, fitted=False),
+        "after": alike(result.after.model, result.after.values, fitted=False),
         "one drag coefficient for all": _held(simulation, first, "quadratic_drag"),
         "one gravity for all": _held(simulation, first, "gravity_scale"),
     }
     each = simulation.made("gravity_scale", simulation.bodies, each=True)
-    start = {p.name: -0.1 for p in each.parameters} | outcome.before.values
-    model = Model(outcome.before.model.family, "none", (each.name,))
-    trap = full_fit(simulation, model, start, budget=20 * (len(start) + 1))
+    start = {p.name: -0.1 for p in each.parameters} | result.before.values
+    model = Model(result.before.model.family, "none", (each.name,))
+    trap = gauss_newton_fit(simulation, model, start, budget=20 * (len(start) + 1))
     rows["one gravity each, which cannot be"] = alike(model, trap.values, fitted=False)
-    terms = [simulation.term(n) for n in outcome.after.model.effects]
+    terms = [simulation.term(n) for n in result.after.model.effects]
     own = {
-        t.bodies[0] if t.bodies else "all": [outcome.after.values[t.parameters[0].name],
-                                             outcome.after.stderr[t.parameters[0].name]]
+        t.bodies[0] if t.bodies else "all": [result.after.values[t.parameters[0].name],
+                                             result.after.stderr[t.parameters[0].name]]
         for t in terms
     }  # fmt: skip
     return {
-        "accepted": list(outcome.after.model.effects), "own": own, "held_out_mm": rows, "refused": found.refused,
+        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows, "refused": found.refused,
         "shared": [
             {"bodies": s.bodies,
              "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.effect)},
-             "spread": unlike(s, outcome, simulation), "information_gain": s.gain,
+             "spread": unlike(s, result, simulation), "information_gain": s.gain,
              "held_out_mm": alike(s.fitted.model, s.fitted.values, fitted=False)}
             for s in found.shared
         ],
         "gravity_each": [9.8 * (1 + trap.values[p.name]) for p in each.parameters],
-        "information_gain_of_gravity_each": outcome.before.bic(trap.samples) - trap.bic(trap.samples),
+        "information_gain_of_gravity_each": result.before.bic(trap.samples) - trap.bic(trap.samples),
         "trials": {
             n: {"fit_mm": t.fitted.fit_mm, "held_out_mm": t.fitted.held_out_mm, "objections": t.reasons,
-                "information_gain": outcome.before.bic(t.fitted.samples) - t.fitted.bic(t.fitted.samples)}
+                "information_gain": result.before.bic(t.fitted.samples) - t.fitted.bic(t.fitted.samples)}
             for n, t in first.items()
         },
         "gravity": 9.8 * (1 + first["gravity_scale"].fitted.values["gravity_scale.relative_change"])
@@ -171,8 +171,8 @@ def damping(
 
     from masiv.effects.catalogue import effect_named
     from masiv.materials.classical import ClassicalLaw
+    from masiv.models.marker_body import simulated_body, simulated_markers
     from masiv.mpm.config import SimulatorConfig
-    from masiv.tracks.body import simulated_body, simulated_markers
     from masiv.tracks.read import read_tracks
 
     with tempfile.TemporaryDirectory() as folder:
@@ -203,11 +203,11 @@ def damping(
 def load(source: Path, youngs: float, viscosity: float, particles: int, courant: float, what: list[str]) -> list[dict]:
     """The loaded beam with one effect at the middle of its end, law and viscosity known: what is left of load52_a, from
     0.1 to 0.6 s after its release, and of load52_b, which is held out."""
+    from masiv.identify.tracks import family_of, simulation_of
+    from masiv.inference.model_fit import gauss_newton_fit
+    from masiv.models.free_body import Model
     from masiv.mpm.config import SimulatorConfig
-    from masiv.refine.model import Model
-    from masiv.refine.refit import full_fit
     from masiv.tracks.config import TracksConfig
-    from masiv.tracks.fit import family_of, simulation_of
     from masiv.tracks.read import read_tracks
 
     with tempfile.TemporaryDirectory() as folder:
@@ -228,7 +228,7 @@ def load(source: Path, youngs: float, viscosity: float, particles: int, courant:
             values |= dict(zip((f"{name}.{axis}" for axis in "xyz"), place, strict=True))
             held = frozenset(f"{name}.{axis}" for axis in "xyz")
         model = Model(family_of("neo_hookean", 1070, law), "none", effects)
-        fitted = full_fit(simulation, model, values, budget=60, held=held)
+        fitted = gauss_newton_fit(simulation, model, values, budget=60, held=held)
         rows.append({
             "effect": name, "load52_a_mm": fitted.fit_mm, "load52_b_mm": fitted.held_out_mm,
             "values": {n: [v, fitted.stderr.get(n)] for n, v in fitted.values.items()},

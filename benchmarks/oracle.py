@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 
-def oracle(simulation, outcome, *, law: str, contact: str, parameters: Mapping[str, float], effects: Mapping) -> dict:
+def oracle(simulation, result, *, law: str, contact: str, parameters: Mapping[str, float], effects: Mapping) -> dict:
     """{fit_mm, held_out_mm, values} of ``told``, whose throw begins at that of refine's model without effects, or of
     its last; {problem} where both diverge."""
     from masiv.errors import MasivError
 
-    starts = [outcome.before] if outcome.after is outcome.before else [outcome.before, outcome.after]
+    starts = [result.before] if result.after is result.before else [result.before, result.after]
     try:
         # Its own substeps: those that the search settled on may be too long for the true stiffness.
-        best = told(type(simulation)(simulation.experiments), starts, law, contact, parameters, effects)
+        best = told(type(simulation)(simulation.observations), starts, law, contact, parameters, effects)
     except MasivError as failed:
         return {"problem": str(failed)}
     found = {n: v for n, v in best.values.items() if "@" not in n}
@@ -27,9 +27,9 @@ def told(simulation, starts: Sequence, law: str, contact: str, parameters: Mappi
     parameters: of the law, effects: {effect: {parameter: value}}.
     """
     from masiv.errors import MasivError
-    from masiv.identify.families import FAMILIES
-    from masiv.refine.model import Model, effect_parameters
-    from masiv.refine.refit import full_fit
+    from masiv.inference.model_fit import gauss_newton_fit
+    from masiv.models.families import FAMILIES
+    from masiv.models.free_body import Model, effect_parameters
 
     model = Model(FAMILIES[law], contact, tuple(effects))
     true = {p.name: effects[n][p.name.split(".")[1]] for n in effects for p in effect_parameters(n)}
@@ -37,7 +37,7 @@ def told(simulation, starts: Sequence, law: str, contact: str, parameters: Mappi
     for start in starts:
         throw = {n: v for n, v in start.values.items() if "@" in n}
         try:
-            fits.append(full_fit(simulation, model, {**throw, **parameters, **true}, budget=24))
+            fits.append(gauss_newton_fit(simulation, model, {**throw, **parameters, **true}, budget=24))
         except MasivError as failed:
             problem = failed
     if problem is not None and not fits:

@@ -55,8 +55,8 @@ def fitted(run: Path, family: str, preset: str, out: Path | None) -> tuple[dict[
     from masiv.config import load_config
     from masiv.continuum.trajectory import Trajectory
     from masiv.identify.stage import identify
+    from masiv.observations.read import read_scene
     from masiv.runfolder import RunFolder
-    from masiv.scene.read import read_scene
 
     runtime.start("cpu")
     folder = RunFolder.open(run)

@@ -61,8 +61,8 @@ def measured(run, truth_file, second, given):
     law = FAMILIES[truth["material"]["type"]]
     known = {PARAMETERS[k]: float(v) for k, v in truth["material"].items() if k in PARAMETERS}
     if effects:
-        contact = found.outcome.after.model.contact
-        told = oracle(found.simulation, found.outcome, law=law, contact=contact, parameters=known, effects=effects)
+        contact = found.result.after.model.contact
+        told = oracle(found.simulation, found.result, law=law, contact=contact, parameters=known, effects=effects)
     keep = ("verdict", "candidates", "accepted", "before", "after", "residual_over_floor", "rounds", "laws")
     return {
         "run": run.name,

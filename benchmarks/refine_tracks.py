@@ -87,85 +87,87 @@ def cases():
     return sorted(out, key=lambda case: case.law != "neo_hookean" or case.name.endswith("_stiff"))
 
 
-def begun(case, config):
+def reset_initial_conditions(case, config):
     """Simulation, experiment, and fits of laws without effects."""
     import torch
     from track_cases import observed
 
     from masiv.checkpoint import Checkpoint
     from masiv.identify.config import IdentifyConfig
+    from masiv.models.free_body import Simulation
+    from masiv.models.prepare import video_observation
     from masiv.mpm.config import SimulatorConfig
+    from masiv.observations.motion import SampledMotion
     from masiv.refine.baselines import baselines
-    from masiv.refine.model import Simulation
-    from masiv.refine.observed import SampledMotion
-    from masiv.refine.prepare import experiment_of
 
     torch.set_num_threads(1)
     scene, motion = observed(case)
     whole = SampledMotion(motion.positions, motion.times, motion.volume)
     cut = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
-    experiment, few, fewer, launch = experiment_of(
+    observation, coarse, coarser, initial_motion = video_observation(
         "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
     )
-    simulation = Simulation([experiment])
-    fits = baselines(simulation, few, fewer, min(launch.last_frame + 2, few.frames), config, Checkpoint(None), quiet)
-    return simulation, experiment, fits
+    simulation = Simulation([observation])
+    fits = baselines(
+        simulation, coarse, coarser, min(initial_motion.last_frame + 2, coarse.frames), config, Checkpoint(None), quiet
+    )
+    return simulation, observation, fits
 
 
 def told_of(case, config):
     """Error of a model that was told, weighed as refine weighs what it has found: as that model moves."""
     from oracle import told
 
-    from masiv.refine.loop import weigh
-    from masiv.refine.model import Simulation
+    from masiv.models.free_body import Simulation
+    from masiv.refine.search import update_residual_std
 
     began = time.time()
-    simulation, _, fits = begun(case, config)
-    observation = [e.sigma for e in simulation.experiments]
+    simulation, _, fits = reset_initial_conditions(case, config)
+    observation_std = [e.residual_std for e in simulation.observations]
     best = min(fits, key=lambda f: f.cost)
-    weigh(simulation, best, observation)
-    own = Simulation(simulation.experiments)  # with substeps that the true stiffness asks for
+    update_residual_std(simulation, best, observation_std)
+    own = Simulation(simulation.observations)  # with substeps that the true stiffness asks for
     best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
-    weigh(own, best, observation)
+    update_residual_std(own, best, observation_std)
     best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
     return {"case": case.name, "oracle": [best.fit_mm, best.held_out_mm], "seconds": [time.time() - began]}
 
 
 def refined(case, config):
-    from masiv.refine.evidence import excess
-    from masiv.refine.loop import close_loop
+    from masiv.refine.evidence import reduced_chi
     from masiv.refine.rounds import like_accepted
+    from masiv.refine.search import search_effects
     from masiv.refine.stage import Refined
     from masiv.refine.summary import verdict
 
     began = time.time()
-    simulation, experiment, fits = begun(case, config)
+    simulation, observation, fits = reset_initial_conditions(case, config)
     middle = time.time()
-    outcome = close_loop(simulation, fits, config, quiet)
+    result = search_effects(simulation, fits, config, quiet)
     end = time.time()
-    first = outcome.rounds[0] if outcome.rounds else None
+    first = result.rounds[0] if result.rounds else None
     return {
         "case": case.name,
         "true": {**case.effects, **case.outside},
-        "verdict": verdict(Refined(outcome, simulation, [], [], None), config),
-        "gap": None if outcome.gap is None else [outcome.gap.fit_mm, outcome.gap.held_out_mm],
+        "verdict": verdict(Refined(result, simulation, [], [], None), config),
+        "gap": None if result.gap is None else [result.gap.fit_mm, result.gap.held_out_mm],
         "laws": [f.model.family.kind for f in fits],
-        "noise_mm": 1e3 * experiment.noise,
-        "excess": [excess(outcome.before, simulation.experiments), excess(outcome.after, simulation.experiments)],
-        "sigma_mm": (1e3 * simulation.experiments[0].sigma).round(1).tolist(),
+        "noise_mm": 1e3 * observation.noise_std,
+        "excess": [reduced_chi(fit, simulation.observations) for fit in (result.before, result.after)],
+        "sigma_mm": (1e3 * simulation.observations[0].residual_std).round(1).tolist(),
         "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
         "trials": [
             (t.fitted.model.family.kind, t.candidate.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.reasons)
-            for r in outcome.rounds for t in r.trials
+            for r in result.rounds for t in r.trials
         ],
-        "accepted": list(outcome.after.model.effects),
-        "or_else": {name: like_accepted(name, outcome.rounds)["or_else"] for name in outcome.after.model.effects},
-        "law": outcome.after.model.family.kind,
-        "values": outcome.after.values,
-        "stderr": outcome.after.stderr,
+        "accepted": list(result.after.model.effects),
+        "or_else": {name: like_accepted(name, result.rounds)["or_else"] for name in result.after.model.effects},
+        "law": result.after.model.family.kind,
+        "values": result.after.values,
+        "stderr": result.after.stderr,
         "confusable": first.confusable if first else {},
-        "before": [outcome.before.fit_mm, outcome.before.held_out_mm],
-        "after": [outcome.after.fit_mm, outcome.after.held_out_mm],
+        "before": [result.before.fit_mm, result.before.held_out_mm],
+        "after": [result.after.fit_mm, result.after.held_out_mm],
         "seconds": [middle - began, end - middle],
     }  # fmt: skip
 

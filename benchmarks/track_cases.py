@@ -16,13 +16,13 @@ from unknown_effects import UNKNOWN
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import Setting
+from masiv.effects.effect import EffectContext
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import rollout
-from masiv.mpm.simulate import thrown
 from masiv.mpm.simulator import Simulator
-from masiv.refine.observed import SampledMotion
+from masiv.observations.motion import SampledMotion
 from masiv.scene.scene import Ground, Scene
+from masiv.simulation.simulate import rigid_initial_state
 from masiv.synth.shapes import make_body
 from masiv.synth.spec import ShapeSpec
 
@@ -65,7 +65,7 @@ def observed(case: Case) -> tuple[Scene, SampledMotion]:
     simulator = Simulator(particle_count=count, spacing=spacing, substep=1 / (FPS * steps), volume=body.volume,
                           density=1000.0, gravity=(0.0, -9.8, 0.0), contact=case.contact, max_substeps=512)  # fmt: skip
     size = float((start - start.mean(0)).norm(dim=1).quantile(0.9)) * 2
-    setting = Setting(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * body.volume / count, size, case.frames / FPS)
+    setting = EffectContext(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * body.volume / count, size, case.frames / FPS)
     members, late = [], 0.0
     for name, values in case.effects.items():
         effect = effect_named(name)
@@ -76,7 +76,7 @@ def observed(case: Case) -> tuple[Scene, SampledMotion]:
     active = ActiveEffects(tuple(members), setting)
     raised, late = float(active.ground_shift()), round(float(active.time_shift()) * FPS * steps)
     shift = torch.tensor([0.0, raised, 0.0])
-    state = thrown(start - shift, torch.tensor(case.velocity), torch.tensor(case.omega))
+    state = rigid_initial_state(start - shift, torch.tensor(case.velocity), torch.tensor(case.omega))
     outputs = [k * steps + late for k in range(1, case.frames)]
     with torch.no_grad():
         moved = rollout(simulator, law, state, outputs[-1], outputs, active) + shift

@@ -26,8 +26,8 @@ def inspect(
     Example: `masiv inspect scenes/bunny --out bunny.png`
     """
     from masiv.config import load_config
+    from masiv.observations.read import read_observation
     from masiv.report.contact_sheet import write_contact_sheet
-    from masiv.scene.read import read_observation
     from masiv.scene.summary import as_text, summarise
     from masiv.tracks.summary import summarise_tracks, tracks_as_text, write_tracks_picture
     from masiv.tracks.tracks import Tracks

@@ -59,16 +59,16 @@ def save(
     """Write refine.json, refine.npz and the report, and where an effect was accepted the new twin and what it gives.
 
     relearn_with: settings with which its law is learnt anew beside the effects; the classical one stays where None."""
-    from masiv.mpm.simulate import simulate
     from masiv.refine.stage import twin_of
     from masiv.refine.summary import summary
+    from masiv.simulation.simulate import simulate
 
     document = summary(found, config, dry_run=dry_run)
     changed = bool(document["accepted"] or document["stop_gap"]) and not dry_run
-    new = twin_of(found.outcome.gap or found.outcome.after, throw, found.simulation, twin)
+    new = twin_of(found.result.gap or found.result.after, throw, found.simulation, twin)
     if relearn_with is not None and changed:
         new = _relearnt(run, relearn_with, new, scene, progress)
-    old = twin_of(found.outcome.before, throw, found.simulation, twin)
+    old = twin_of(found.result.before, throw, found.simulation, twin)
     dynamic = stages.load_dynamic(run)
     rollouts = {
         name: simulate(model, frames=scene.frame_count, fps=scene.fps, progress=progress).positions
@@ -115,11 +115,11 @@ def _forget(run: RunFolder) -> None:
 
 def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: Progress) -> None:
     """Write report.html, and before it what the run lacks of rollout, material.json and metrics.json."""
-    from masiv.mpm.simulate import simulate
     from masiv.report.material import MATERIAL
     from masiv.report.numbers import material_numbers, run_numbers
     from masiv.report.report import write_report
     from masiv.runfolder import load_motion
+    from masiv.simulation.simulate import simulate
     from masiv.twin import Twin
 
     progress("report", 0, 1)
@@ -162,7 +162,7 @@ def _pictures(scene: Scene, dynamic, positions: np.ndarray, throw: Throw, progre
 
 def _save_fields(path: Path, found: Refined) -> None:
     """Residuals of the first throw (K, N, 3) [m, world], simulated less observed, where they are and when."""
-    problem = found.simulation.experiments[0].problem
+    problem = found.simulation.observations[0].problem
     turn = problem.axes.vectors_to_world
     temporary = path.with_suffix(".tmp.npz")
     np.savez_compressed(
@@ -171,15 +171,15 @@ def _save_fields(path: Path, found: Refined) -> None:
         after=turn(found.after[0]).astype(np.float32),
         positions=problem.axes.points_to_world(problem.start.double().numpy()).astype(np.float32),
         times=np.arange(1, len(found.before[0]) + 1) / (problem.samples * problem.scene.fps),
-        fitted=found.simulation.experiments[0].rows,
+        fitted=found.simulation.observations[0].fit_count,
     )
     os.replace(temporary, path)
 
 
 def _save_rollout(run: RunFolder, positions: np.ndarray, scene: Scene) -> None:
-    from masiv.mpm.simulate import Motion
+    from masiv.simulation.simulate import Rollout
 
-    Motion(positions, scene.times).save(run.rollout)
+    Rollout(positions, scene.times).save(run.rollout)
 
 
 def _keep_old(run: Path) -> None:

@@ -99,11 +99,11 @@ def simulate(
         raise InputError("--blend W needs --law OTHER_RUN, the run whose material is blended in")
     strength = vector(force, "--force")
     stages.start(settings)
-    from masiv.mpm.simulate import Push
-    from masiv.mpm.simulate import simulate as roll
-    from masiv.mpm.twin_effects import body_mass
-    from masiv.mpm.variation import without_effects
     from masiv.report.film import film
+    from masiv.simulation.simulate import Push
+    from masiv.simulation.simulate import simulate as roll
+    from masiv.simulation.twin_effects import body_mass
+    from masiv.simulation.variation import without_effects
 
     push = None
     if strength is not None:

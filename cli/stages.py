@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 from masiv import runtime
 from masiv.config import Config, load_config
 from masiv.errors import InputError
+from masiv.observations.read import read_scene
 from masiv.progress import Progress, silent
 from masiv.report.history import logged
 from masiv.report.material import MATERIAL
 from masiv.runfolder import Request, RunFolder
-from masiv.scene.read import read_scene
 from masiv.scene.scene import Scene
 from masiv.scene.summary import identity
 
@@ -201,15 +201,15 @@ def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress)
 @contextmanager
 def described(run: RunFolder, config: Config, twin: Twin) -> Iterator[None]:
     """Beside what the body of this context does, in a process of its own, material.json is made where it lacks."""
-    from masiv.workers import Workers, demanded, processes_wanted
+    from masiv.workers import Workers, processes_wanted, unwrap
 
     if (run.path / MATERIAL).is_file():
         yield
         return
     with Workers(min(2, processes_wanted(config.identify.processes)), "identify.processes") as workers:
-        found = workers.beside(describe, (run, twin))
+        found = workers.submit(describe, (run, twin))
         yield
-        demanded(found())
+        unwrap(found())
 
 
 def describe(run: RunFolder, twin: Twin, progress: Progress = silent) -> None:
@@ -236,7 +236,7 @@ def varied(
     Raises InputError for a run or a mesh that is not there or cannot be used.
     """
     from masiv.materials.blend import blend as between
-    from masiv.mpm import variation
+    from masiv.simulation import variation
     from masiv.twin import Twin
 
     twin = Twin.load(run.path)
@@ -272,7 +272,7 @@ def _other(path: Path, flag: str) -> Path:
 
 
 def _over(twin: Twin, ground: str | None) -> Twin:
-    from masiv.mpm.variation import with_ground
+    from masiv.simulation.variation import with_ground
 
     return twin if ground is None else with_ground(twin, ground)
 

@@ -85,7 +85,7 @@ def identify(run: RunFolder, config: Config, tracks: Tracks) -> tuple[dict[str, 
     from .console import progress_bar
 
     runtime.start(config.arch)
-    from masiv.tracks.stage import identify_tracks
+    from masiv.refine.tracks_stage import identify_tracks
     from masiv.tracks.twin import TracksTwin
 
     families = []
@@ -136,10 +136,10 @@ def report(
     """Simulate every run with the twin, and with that before refine where there is one; metrics.json, rollout.npz,
     report.html. Returns the errors of each run."""
 
-    from masiv.tracks.document import named, observed_of
-    from masiv.tracks.novel import save_rollout
-    from masiv.tracks.page import write_page
-    from masiv.tracks.stage import run_errors, simulated
+    from masiv.refine.tracks_document import named, observed_of
+    from masiv.refine.tracks_stage import run_errors, simulated
+    from masiv.report.tracks_page import write_page
+    from masiv.simulation.tracks import save_rollout
     from masiv.tracks.twin import TracksTwin
 
     twins = {"after": twin} if not (run.path / BEFORE).is_file() else {
@@ -158,11 +158,11 @@ def report(
             progress("report: simulate", done, len(scopes), name)
             made = simulated(tracks, model, config, scope)
             fields = made.fields()
-            for r, f in zip(made.simulation.experiments, fields, strict=True):
+            for r, f in zip(made.simulation.observations, fields, strict=True):
                 observed = observed_of(r)
                 own = curves.setdefault(r.name, {"times": r.times, "observed": observed})
                 own[name] = observed + f
-            for row in run_errors(made.simulation.experiments, fields):
+            for row in run_errors(made.simulation.observations, fields):
                 error = row.pop("rmse_mm")
                 rows.setdefault(row["run"], row)[f"{name}_mm"] = error
     progress("report: simulate", len(scopes), len(scopes))
@@ -183,10 +183,10 @@ def refine(
     from .console import progress_bar
 
     runtime.start(config.arch)
+    from masiv.identify.tracks import conditions
     from masiv.refine.summary import ADDED, text
-    from masiv.tracks.document import document, named, save_fields
-    from masiv.tracks.fit import conditions
-    from masiv.tracks.stage import refine_tracks, twin_after
+    from masiv.refine.tracks_document import document, named, save_fields
+    from masiv.refine.tracks_stage import refine_tracks, twin_after
     from masiv.tracks.twin import TracksTwin
 
     twin = TracksTwin.load(run.path)
@@ -227,7 +227,7 @@ def simulate(
 ) -> tuple[dict[str, Any], str]:  # fmt: skip
     """rollout.npz with particles and markers."""
     runtime.start(config.arch)
-    from masiv.tracks.novel import save_rollout, simulate_tracks
+    from masiv.simulation.tracks import save_rollout, simulate_tracks
     from masiv.tracks.twin import TracksTwin
 
     twin = TracksTwin.load(run.path)

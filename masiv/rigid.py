@@ -33,7 +33,7 @@ def beyond_uniform(positions: np.ndarray) -> np.ndarray:
     return np.array([np.sqrt(((p - basis @ (basis.T @ p)) ** 2).sum(1).mean()) for p in positions[1:]])
 
 
-def still_rigid(distances: np.ndarray) -> int:
+def first_contact_frame(distances: np.ndarray) -> int:
     """How many of the frames with these ``beyond_rigid`` pass before the body hits something; at least two are taken to
     be free, if there are as many."""
     for frame in range(2, len(distances)):
@@ -44,7 +44,7 @@ def still_rigid(distances: np.ndarray) -> int:
 
 def free_flight(positions: np.ndarray, times: np.ndarray, gravity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """velocity (3,) [m/s] of the centroid and omega (3,) [rad/s] at the first of ``times`` (T,) [s] of a body that
-    flies at positions (T, N, 3) [m], T >= 2: least squares on ``flown``."""
+    flies at positions (T, N, 3) [m], T >= 2: least squares on ``ballistic_positions``."""
     t = times[1:] - times[0]
     centres = positions.mean(1)
     # Fall is known, so that what is left is linear in time; late frames tell more of a velocity: least squares through
@@ -87,7 +87,9 @@ def _spin(turn: Rotation, inverse: np.ndarray, momentum: np.ndarray) -> np.ndarr
     return turn.apply(inverse @ turn.inv().apply(momentum))
 
 
-def flown(start: np.ndarray, velocity: np.ndarray, omega: np.ndarray, gravity: np.ndarray, time: float) -> np.ndarray:
+def ballistic_positions(
+    start: np.ndarray, velocity: np.ndarray, omega: np.ndarray, gravity: np.ndarray, time: float
+) -> np.ndarray:
     """Where points ``start`` (N, 3) [m] of a body, its mass even over them, are after ``time`` [s] of free flight:
     x(t) = c + v t + g t^2 / 2 + R(t) (x0 - c), R of ``turned_freely``."""
     centre = start.mean(0)
@@ -95,13 +97,13 @@ def flown(start: np.ndarray, velocity: np.ndarray, omega: np.ndarray, gravity: n
     return centre + velocity * time + 0.5 * gravity * time**2 + turned
 
 
-def struck(positions: np.ndarray, times: np.ndarray, gravity: np.ndarray) -> np.ndarray | None:
+def impact_point(positions: np.ndarray, times: np.ndarray, gravity: np.ndarray) -> np.ndarray | None:
     """Where (3,) [m] a body in free flight at positions (T, N, 3) [m] first hit something: the place that the hundredth
     of its points that are then farthest from their flight would have reached. None where it flies all the time."""
-    last = still_rigid(beyond_rigid(positions))
+    last = first_contact_frame(beyond_rigid(positions))
     if last + 1 >= len(positions):
         return None
     velocity, omega = free_flight(positions[: last + 1], times[: last + 1], gravity)
-    due = flown(positions[0], velocity, omega, gravity, float(times[last + 1] - times[0]))
+    due = ballistic_positions(positions[0], velocity, omega, gravity, float(times[last + 1] - times[0]))
     missed = np.linalg.norm(positions[last + 1] - due, axis=1)
     return due[missed >= np.quantile(missed, 0.99)].mean(0)

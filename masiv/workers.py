@@ -35,7 +35,7 @@ def processes_wanted(asked: int) -> int:
     return asked or min(runtime.threads(), AT_MOST)
 
 
-class Failed:
+class TaskError:
     """What a task that raised a MasivError gives: what it said, and whether the input was to blame."""
 
     def __init__(self, failed: MasivError) -> None:
@@ -43,9 +43,9 @@ class Failed:
         self.kind = InputError if isinstance(failed, InputError) else MasivError
 
 
-def demanded(found: Any) -> Any:
-    """``found``, unless it is ``Failed``. Raises MasivError, InputError where the input was to blame."""
-    if isinstance(found, Failed):
+def unwrap(found: Any) -> Any:
+    """``found``, unless it is ``TaskError``. Raises MasivError, InputError where the input was to blame."""
+    if isinstance(found, TaskError):
         raise found.kind(found.reason)
     return found
 
@@ -75,12 +75,12 @@ class Workers:
             self._started()
 
     def map(self, function: Callable, tasks: Iterable[tuple]) -> Iterator[Any]:
-        """``function(*task)`` of each, in order, or ``Failed``. The function and its arguments must be picklable.
+        """``function(*task)`` of each, in order, or ``TaskError``. The function and its arguments must be picklable.
 
         Raises MasivError where a process dies."""
         tasks = list(tasks)
         if self.processes == 1 or len(tasks) == 1:
-            yield from (attempt(function, task) for task in tasks)
+            yield from (run_task(function, task) for task in tasks)
             return
         futures = [self._submitted(function, task) for task in tasks]
         try:
@@ -90,17 +90,17 @@ class Workers:
             for future in futures:
                 future.cancel()
 
-    def beside(self, function: Callable, task: tuple) -> Callable[[], Any]:
-        """Begin ``function(*task)`` in another process and go on; what is returned waits for its result, or ``Failed``.
+    def submit(self, function: Callable, task: tuple) -> Callable[[], Any]:
+        """Begin ``function(*task)`` in another process and go on. Returns a function that waits for its result.
         Where there is no other process the task runs then. Raises MasivError where the process has died."""
         if self.processes == 1:
-            return lambda: attempt(function, task)
+            return lambda: run_task(function, task)
         future = self._submitted(function, task)
         return lambda: self._result(future)
 
     def _submitted(self, function: Callable, task: tuple) -> Any:
         """The future of ``function(*task)`` in another process."""
-        return self._started().submit(_attempt_copied, pickle.dumps((function, task)))
+        return self._started().submit(_run_pickled_task, pickle.dumps((function, task)))
 
     def _result(self, future: Any) -> Any:
         from concurrent.futures.process import BrokenProcessPool
@@ -152,14 +152,14 @@ def _nothing() -> None:
     pass
 
 
-def _attempt_copied(pickled: bytes) -> bytes:
-    """``attempt`` in another process."""
-    return pickle.dumps(attempt(*pickle.loads(pickled)))
+def _run_pickled_task(pickled: bytes) -> bytes:
+    """``run_task`` in another process."""
+    return pickle.dumps(run_task(*pickle.loads(pickled)))
 
 
-def attempt(function: Callable, task: tuple) -> Any:
-    """``function(*task)``, or ``Failed`` where that raises a MasivError."""
+def run_task(function: Callable, task: tuple) -> Any:
+    """``function(*task)``, or ``TaskError`` where that raises a MasivError."""
     try:
         return function(*task)
     except MasivError as failed:
-        return Failed(failed)
+        return TaskError(failed)

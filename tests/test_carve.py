@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from ring_scene import spheres_scene
 
-from masiv.continuum.carve import visual_hull
-from masiv.continuum.silhouette import sample_bilinear, signed_distance
 from masiv.errors import InputError, MasivError
+from masiv.hull.carve import visual_hull
+from masiv.hull.silhouette import sample_bilinear, signed_distance
 
 CENTRE, RADIUS = np.array([0.15, 0.5, -0.1]), 0.25
 

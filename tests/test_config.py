@@ -72,7 +72,7 @@ def test_bad_settings_say_which_key(tmp_path, text, message):
 
 def test_light_modules_do_not_import_torch_or_taichi():
     code = (
-        "import sys, masiv.config, masiv.cli.main, masiv.runfolder, masiv.scene.read\n"
+        "import sys, masiv.config, masiv.cli.main, masiv.runfolder, masiv.observations.read\n"
         "assert not {'torch', 'taichi', 'matplotlib'} & set(sys.modules), sorted(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -7,12 +7,12 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects
-from masiv.effects.effect import Setting
+from masiv.effects.effect import EffectContext
 from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import rollout
-from masiv.mpm.simulate import thrown
 from masiv.mpm.simulator import Simulator
+from masiv.simulation.simulate import rigid_initial_state
 
 F64 = torch.float64
 DT, STEPS = 1e-3, 40
@@ -27,7 +27,7 @@ def body(count=200, height=0.02):
 
 
 def setting(x):
-    return Setting(torch.tensor([0.0, -9.8, 0.0], dtype=x.dtype), x, 1e3 * 0.2**3 / len(x), 0.2, STEPS * DT)
+    return EffectContext(torch.tensor([0.0, -9.8, 0.0], dtype=x.dtype), x, 1e3 * 0.2**3 / len(x), 0.2, STEPS * DT)
 
 
 def simulator(count, contact="sticky", gravity=(0, -9.8, 0), friction=0.3, dtype=F64):
@@ -37,7 +37,7 @@ def simulator(count, contact="sticky", gravity=(0, -9.8, 0), friction=0.3, dtype
 
 
 def thrown_body(x):
-    return thrown(x, torch.tensor([0.6, -1.2, 0.3], dtype=F64), torch.tensor([2.0, 1.0, -3.0], dtype=F64))
+    return rigid_initial_state(x, torch.tensor([0.6, -1.2, 0.3], dtype=F64), torch.tensor([2.0, 1.0, -3.0], dtype=F64))
 
 
 def positions(theta, effect, x, contact="sticky"):
@@ -98,7 +98,7 @@ def gradients(effect, contact, dtype):
     active = ActiveEffects(((effect, theta),), setting(x))
     launch = [torch.tensor(v, dtype=dtype, requires_grad=True) for v in ([0.6, -1.2, 0.3], [2.0, 1.0, -3.0])]
     sim = simulator(len(x), contact, dtype=dtype)
-    end = rollout(sim, LAW, thrown(x, *launch), STEPS, [STEPS], active)[0]
+    end = rollout(sim, LAW, rigid_initial_state(x, *launch), STEPS, [STEPS], active)[0]
     (weights.to(dtype) * end).sum().backward()
     bars = [*(v.grad for v in launch), torch.zeros_like(theta) if theta.grad is None else theta.grad]
     return torch.cat([bar.to(F64) for bar in bars])

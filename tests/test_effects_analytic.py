@@ -13,7 +13,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.mpm.simulate import thrown
+from masiv.simulation.simulate import rigid_initial_state
 
 WEIGHTLESS = (0.0, 0.0, 0.0)
 G = 9.8
@@ -22,7 +22,11 @@ G = 9.8
 def run(name, theta, steps, *, x=None, velocity=(0, 0, 0), omega=(0, 0, 0), outputs=None, law=LAW, state=None, **kind):
     """Positions (K, N, 3) at the substeps ``outputs``, the last two by default, of a body far above ground."""
     x = body(height=5.0) if x is None else x
-    state = thrown(x, torch.tensor(velocity, dtype=F64), torch.tensor(omega, dtype=F64)) if state is None else state
+    state = (
+        rigid_initial_state(x, torch.tensor(velocity, dtype=F64), torch.tensor(omega, dtype=F64))
+        if state is None
+        else state
+    )
     active = None
     if name is not None:
         active = ActiveEffects(((effects()[name], torch.tensor(theta, dtype=F64)),), setting(x))
@@ -165,7 +169,9 @@ def test_point_force_on_a_heavier_body_moves_it_less():
         for n, v in (("point_mass", [8.0, 0.1, 5.1, 0.1]), ("point_force", [4.0, 0, 0, 0.1, 5.1, 0.1]))
     )
     active = ActiveEffects(members, setting(x))
-    moved = rollout(simulator(len(x), **kind), LAW, thrown(x, *torch.zeros(2, 3, dtype=F64)), 40, [39, 40], active)
+    moved = rollout(
+        simulator(len(x), **kind), LAW, rigid_initial_state(x, *torch.zeros(2, 3, dtype=F64)), 40, [39, 40], active
+    )
     share = (active.mass_factor() / active.mass_factor().sum())[:, None]
     velocity = (share * (moved[-1] - moved[-2]) / DT).sum(0)
     np.testing.assert_allclose(velocity.numpy(), [4.0 * 0.04 / 16.0, 0, 0], rtol=0.03, atol=1e-9)
@@ -231,17 +237,17 @@ def test_restitution_frees_what_sticky_ground_keeps():
 def test_a_force_is_periodic_when_it_has_come_round():
     shaken = effects()["periodic_force"]
     theta = torch.tensor([1.0, 0, 0, 0, 0, 0, 2.0])
-    assert shaken.unseen(theta, 0.6, torch.zeros(1, 3)) is None
-    assert "no whole period of 2 Hz" in shaken.unseen(theta, 0.4, torch.zeros(1, 3))
-    assert effects()["linear_drag"].unseen(torch.tensor([1.0]), 0.01, torch.zeros(1, 3)) is None
+    assert shaken.identifiability_issue(theta, 0.6, torch.zeros(1, 3)) is None
+    assert "no whole period of 2 Hz" in shaken.identifiability_issue(theta, 0.4, torch.zeros(1, 3))
+    assert effects()["linear_drag"].identifiability_issue(torch.tensor([1.0]), 0.01, torch.zeros(1, 3)) is None
 
 
 def test_a_swirl_far_from_its_axis_is_a_uniform_force():
     random = np.random.default_rng(0)
     places = torch.tensor(random.uniform((0.1, 0.3, -0.2), (0.5, 0.7, 0.2), (200, 3)))  # 0.16 m about their mean
     swirl = effects()["swirl"]
-    assert swirl.unseen(torch.tensor([6.0, 0.0, 0.0]), 0.5, places) is None
-    assert "is but a uniform force" in swirl.unseen(torch.tensor([0.6, 0.3, -1.0]), 0.5, places)
+    assert swirl.identifiability_issue(torch.tensor([6.0, 0.0, 0.0]), 0.5, places) is None
+    assert "is but a uniform force" in swirl.identifiability_issue(torch.tensor([0.6, 0.3, -1.0]), 0.5, places)
 
 
 @torch.enable_grad()

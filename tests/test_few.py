@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from masiv.identify.few import at_random, well_spread
+from masiv.subsample import kd_tree_subset, random_subset
 from masiv.synth.shapes import make_body
 from masiv.synth.spec import ShapeSpec
 
@@ -17,7 +17,7 @@ def test_each_point_at_most_once_and_as_many_as_asked(data):
     count = data.draw(st.integers(1, total))
     seed = data.draw(st.integers(0, 2**16))
     points = np.round(np.random.default_rng(seed).normal(size=(total, 3)), 1)  # with some that coincide
-    chosen = well_spread(points, count)
+    chosen = kd_tree_subset(points, count)
     assert len(chosen) == count
     assert (np.diff(chosen) > 0).all()
     assert chosen[0] >= 0
@@ -35,7 +35,7 @@ def test_mass_and_axes_are_those_of_the_body(kind):
         there = points[chosen]
         return np.linalg.norm(there.mean(0) - mean), np.linalg.norm(np.cov(there.T) - moments) / np.linalg.norm(moments)
 
-    centre, shape = off(well_spread(points, 800))
+    centre, shape = off(kd_tree_subset(points, 800))
     assert centre < 1e-3
     assert shape < 0.02
     assert centre < off(random)[0] / 3
@@ -44,13 +44,13 @@ def test_mass_and_axes_are_those_of_the_body(kind):
 def test_where_there_are_no_more_all_are_taken():
     points = np.random.default_rng(0).normal(size=(4, 3))
     for count in (4, 5):
-        np.testing.assert_array_equal(well_spread(points, count), np.arange(4))
-        np.testing.assert_array_equal(at_random(4, count, seed=0), np.arange(4))
+        np.testing.assert_array_equal(kd_tree_subset(points, count), np.arange(4))
+        np.testing.assert_array_equal(random_subset(4, count, seed=0), np.arange(4))
 
 
 def test_drawn_at_random_each_once():
-    chosen = at_random(50, 20, seed=3)
+    chosen = random_subset(50, 20, seed=3)
     assert len(chosen) == 20
     assert (np.diff(chosen) > 0).all()
-    np.testing.assert_array_equal(chosen, at_random(50, 20, seed=3))
-    assert not np.array_equal(chosen, at_random(50, 20, seed=4))
+    np.testing.assert_array_equal(chosen, random_subset(50, 20, seed=3))
+    assert not np.array_equal(chosen, random_subset(50, 20, seed=4))

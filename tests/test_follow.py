@@ -164,8 +164,8 @@ def test_without_a_further_frame_there_is_nothing_to_follow(scene, fitted, follo
 
 
 def test_a_run_measures_its_held_out_frames_once(scene, fitted, particles, tmp_path):
-    quick, few = CONFIG.model_copy(update={"iterations": 20}), TRAJECTORY.model_copy(update={"iterations": 2})
-    settings = Config(reconstruct=quick, trajectory=few)
+    quick, coarse = CONFIG.model_copy(update={"iterations": 20}), TRAJECTORY.model_copy(update={"iterations": 2})
+    settings = Config(reconstruct=quick, trajectory=coarse)
     visible = dataclasses.replace(scene, hidden_views=())
 
     def run_of(name, fit_frames):

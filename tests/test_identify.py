@@ -10,17 +10,17 @@ from scipy.spatial.transform import Rotation
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.launch import estimate_launch
-from masiv.identify.problem import Motion, Problem
 from masiv.identify.stage import identify
 from masiv.identify.start import DIVERGED, STIFFEST, Start, _error, best_first
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.pretrain import pretrained_path
+from masiv.models.initial_motion import estimate_initial_motion
+from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
-from masiv.mpm.simulate import simulate
-from masiv.mpm.split import wholes
 from masiv.scene.scene import Ground, Scene
+from masiv.simulation.simulate import simulate
+from masiv.simulation.subdivide import wholes
 from masiv.twin import Twin
 
 GRAVITY = np.array([0.0, -9.8, 0.0])
@@ -79,14 +79,14 @@ def test_launch_of_a_rigid_throw(body):
         centre + VELOCITY * t + 0.5 * GRAVITY * t**2 + (body - centre) @ Rotation.from_rotvec(OMEGA * t).as_matrix().T
         for t in times
     ])  # fmt: skip
-    launch = estimate_launch(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
-    np.testing.assert_allclose(launch.velocity, VELOCITY, atol=1e-5)
-    np.testing.assert_allclose(launch.omega, OMEGA, atol=1e-5)
-    assert launch.last_frame == 5
+    initial_motion = estimate_initial_motion(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
+    np.testing.assert_allclose(initial_motion.velocity, VELOCITY, atol=1e-5)
+    np.testing.assert_allclose(initial_motion.omega, OMEGA, atol=1e-5)
+    assert initial_motion.last_frame == 5
     # What follows the contact must not count.
     path[4:] = path[3]
     height = np.quantile(path[3] @ UP, 0.01) - 0.06
-    late = estimate_launch(path, times, GRAVITY, Ground(UP, height), clearance=0.08)
+    late = estimate_initial_motion(path, times, GRAVITY, Ground(UP, height), clearance=0.08)
     np.testing.assert_allclose(late.velocity, VELOCITY, atol=1e-5)
 
 
@@ -94,12 +94,12 @@ def test_flight_ends_where_the_body_hits_what_nobody_declared(body):
     times = np.arange(8) / FPS
     path = body + VELOCITY * times[:, None, None] + 0.5 * GRAVITY * times[:, None, None] ** 2
     path[1:] += 1e-3 * np.random.default_rng(0).normal(size=path[1:].shape)
-    free = estimate_launch(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
+    free = estimate_initial_motion(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
     assert free.last_frame == 7
     for frame in (5, 6, 7):  # flattened, ever more
         path[frame, :, 1] = path[frame].mean(0)[1] + (1 - 0.1 * (frame - 4)) * (path[frame] - path[frame].mean(0))[:, 1]
-    launch = estimate_launch(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
-    assert launch.last_frame == 4
+    initial_motion = estimate_initial_motion(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
+    assert initial_motion.last_frame == 4
 
 
 def settings(**changes):
@@ -131,7 +131,7 @@ def test_no_start_is_stiffer_than_a_motion_could_tell(seen):
     problem = Problem(
         scene(), seen[0], settings(), SimulatorConfig(), chosen=np.arange(0, len(seen[0].positions[0]), 4)
     )
-    motion = Motion.of_world(problem.axes, VELOCITY, OMEGA)
+    motion = InitialState.of_world(problem.axes, VELOCITY, OMEGA)
     errors = [_error(problem, motion, "jelly", "sticky", share * STIFFEST) for share in (0.5, 1.01)]
     assert errors[0] < DIVERGED  # it could be simulated, and so could the stiffer one
     assert errors[1] == DIVERGED
@@ -166,8 +166,10 @@ def test_twin_survives_saving(seen, tmp_path):
     again = Twin.load(tmp_path)
     assert np.array_equal(simulate(twin, frames=4).positions, simulate(again, frames=4).positions)
     # A prediction starts from the identified motion, and what is asked for has an effect.
-    thrown = simulate(again, frames=2, velocity=np.array([1.0, 0.0, 0.0]), gravity=np.zeros(3))
-    np.testing.assert_allclose((thrown.positions[1] - thrown.positions[0]).mean(0) * FPS, [1.0, 0.0, 0.0], atol=1e-3)
+    rigid_initial_state = simulate(again, frames=2, velocity=np.array([1.0, 0.0, 0.0]), gravity=np.zeros(3))
+    np.testing.assert_allclose(
+        (rigid_initial_state.positions[1] - rigid_initial_state.positions[0]).mean(0) * FPS, [1.0, 0.0, 0.0], atol=1e-3
+    )
     with pytest.raises(InputError, match="--velocity"):
         simulate(again, frames=2, velocity=np.array([np.nan, 0.0, 0.0]))
     (tmp_path / "twin.yaml").write_text("schema: 1\n")

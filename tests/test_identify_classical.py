@@ -8,15 +8,16 @@ import pytest
 from test_identify import FPS, FRAMES, GRAVITY, GROUND, OMEGA, UP, VELOCITY, Seen, scene
 
 from masiv.checkpoint import Checkpoint
-from masiv.identify import baseline, families
+from masiv.identify import baseline
 from masiv.identify.classical_fit import FamilyFit, ranked
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.correlation import effective_samples
-from masiv.identify.families import FAMILIES, law_of
 from masiv.identify.stage import identify
+from masiv.inference.correlation import effective_samples
 from masiv.materials.classical import ClassicalLaw
+from masiv.models import families
+from masiv.models.families import FAMILIES, law_of
 from masiv.mpm.config import SimulatorConfig
-from masiv.mpm.simulate import simulate
+from masiv.simulation.simulate import simulate
 from masiv.twin import Twin
 
 
@@ -100,8 +101,8 @@ def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(body, tmp_path):
 
 @pytest.mark.usefixtures("taichi")
 def test_auto_names_the_family_that_moved_so(body, monkeypatch):
-    few = {kind: dataclasses.replace(FAMILIES[kind], search={}) for kind in ("newtonian", "neo_hookean")}
-    monkeypatch.setattr(baseline, "FAMILIES", few)
+    coarse = {kind: dataclasses.replace(FAMILIES[kind], search={}) for kind in ("newtonian", "neo_hookean")}
+    monkeypatch.setattr(baseline, "FAMILIES", coarse)
     seen = filmed(body, ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3))
     twin = identify(scene(), seen, settings("auto", family_rollouts=24), SimulatorConfig())
     assert twin.fit["law"] == twin.law.kind == "neo_hookean"

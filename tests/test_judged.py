@@ -9,9 +9,9 @@ from test_polish import filmed, problem_of  # noqa: F401
 from masiv.checkpoint import Checkpoint
 from masiv.identify import baseline
 from masiv.identify.classical_fit import FamilyFit
-from masiv.identify.families import motion_parameters
 from masiv.identify.judged import nearest_first, picture_errors_of
-from masiv.identify.problem import Motion
+from masiv.models.families import initial_state_parameters
+from masiv.models.problem import InitialState
 from masiv.workers import Workers
 
 TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
@@ -19,7 +19,7 @@ WRONG = {"viscosity": 40.0, "bulk_modulus": 1e5}
 
 
 def fitted(problem, kind, values, mean_square):
-    throw = motion_parameters(problem, Motion.of_world(problem.axes, VELOCITY, OMEGA))
+    throw = initial_state_parameters(problem, InitialState.of_world(problem.axes, VELOCITY, OMEGA))
     every = {**values, **{p.name: p.start for p in throw}}
     return FamilyFit(kind, "sticky", every, mean_square=mean_square, samples=100)
 

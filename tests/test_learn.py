@@ -7,10 +7,10 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.identify import learn
 from masiv.identify.fit import Fit
-from masiv.identify.problem import Motion, Problem
 from masiv.identify.start import Start
 from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
+from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import silent
 
@@ -35,7 +35,7 @@ def learnt(seen, monkeypatch, errors, objectives, pictures=None):  # noqa: F811
         by_objective = {objectives[name]: pictures[name] for name in pictures}
         monkeypatch.setattr(learn, "wanted", lambda _: True)
         monkeypatch.setattr(learn, "polish", lambda _, fitted, *__, **___: (fitted, by_objective[fitted.objective], {}))
-    motion = Motion.of_world(problem.axes, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    motion = InitialState.of_world(problem.axes, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     found = learn.learn([Throw(problem, motion, 3)], lambda: problem, 0, Checkpoint(None), silent)
     return found.report["start"], fitted
 

@@ -9,10 +9,10 @@ from test_polish import filmed, problem_of  # noqa: F401
 
 from masiv.checkpoint import Checkpoint
 from masiv.identify.classical_fit import fit_all_particles, fit_family, fit_further, search
-from masiv.identify.families import FAMILIES, motion_parameters
 from masiv.identify.misfit import Misfit
-from masiv.identify.problem import Motion
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.families import FAMILIES, initial_state_parameters
+from masiv.models.problem import InitialState
 from masiv.progress import silent
 
 TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
@@ -21,7 +21,7 @@ DRIFT = np.array([0.25, 0.0, 0.0])
 
 
 def values_of(problem, **changes):
-    throw = motion_parameters(problem, Motion.of_world(problem.axes, VELOCITY, OMEGA))
+    throw = initial_state_parameters(problem, InitialState.of_world(problem.axes, VELOCITY, OMEGA))
     return {**TRUE, **{p.name: p.start for p in throw}, **changes}
 
 
@@ -59,7 +59,7 @@ def test_paths_that_drift_are_overruled(filmed, seen):  # noqa: F811
     drifted = Seen(true.positions + drift, true.times, true.volume), seen[1]
     off = []
     problem = problem_of(filmed, drifted, family_rollouts=25, samples_per_frame=1)
-    begun = Motion.of_world(problem.axes, VELOCITY + DRIFT, OMEGA)
+    begun = InitialState.of_world(problem.axes, VELOCITY + DRIFT, OMEGA)
     for pictures in (False, True):
         found = fit_family(
             "neo_hookean", problem, begun, problem.frames, Checkpoint(None), silent, share=0.5, pictures=pictures
@@ -75,8 +75,10 @@ def test_the_search_of_a_start_looks_at_pictures_too(filmed, seen, monkeypatch):
     """Paths as a body twenty times as stiff would have them."""
     law = ClassicalLaw("neo_hookean", youngs_modulus=6e5, poissons_ratio=0.3)
     problem = problem_of(filmed, seen, silhouette_weight=5.0, paint_weight=0.0)
-    problem.targets = problem.run(law, Motion.of_world(problem.axes, VELOCITY, OMEGA), "sticky", problem.frames)
+    problem.targets = problem.run(law, InitialState.of_world(problem.axes, VELOCITY, OMEGA), "sticky", problem.frames)
     family = replace(FAMILIES["neo_hookean"], search={"youngs_modulus": (3e4, 6e5)})
-    thrown = Motion.of_world(problem.axes, VELOCITY, OMEGA)
-    found = [search(problem, family, thrown, silent, pictures=p).values["youngs_modulus"] for p in (False, True)]
+    rigid_initial_state = InitialState.of_world(problem.axes, VELOCITY, OMEGA)
+    found = [
+        search(problem, family, rigid_initial_state, silent, pictures=p).values["youngs_modulus"] for p in (False, True)
+    ]
     assert found == [6e5, 3e4]

@@ -15,8 +15,8 @@ from masiv.materials.neural import NeuralLaw
 from masiv.materials.pretrain import pretrained_path
 from masiv.mpm._reference import _substep
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.mpm.simulate import thrown
 from masiv.mpm.simulator import Simulator, State
+from masiv.simulation.simulate import rigid_initial_state
 
 pytestmark = pytest.mark.usefixtures("taichi")
 F64 = torch.float64
@@ -44,7 +44,9 @@ def blob(count=60, height=0.5, seed=1):
 
 
 def test_ballistic_fall():
-    start = thrown(blob(height=5.0).position, torch.tensor([0.4, 1.0, 0.0]).double(), torch.zeros(3).double())
+    start = rigid_initial_state(
+        blob(height=5.0).position, torch.tensor([0.4, 1.0, 0.0]).double(), torch.zeros(3).double()
+    )
     steps, dt = 60, 2e-3
     end = simulator(60).run(start, elastic(), steps, [steps]).positions[0]
     # Symplectic Euler falls g t (t + dt) / 2: half a g t^2 to first order in the substep.
@@ -209,8 +211,8 @@ def test_body_rests_on_the_ground_at_its_true_height():
     """No clamp lifts what starts near the plane: a particle 1 mm above it stays there."""
     x = blob(60, height=0.0).position
     x[0, 1] = 1e-3
-    end = simulator(60, gravity=(0.0, 0.0, 0.0)).run(thrown(x, torch.zeros(3).double(), torch.zeros(3).double()),
-                                                      elastic(), 10, [10]).positions[0]  # fmt: skip
+    state = rigid_initial_state(x, torch.zeros(3).double(), torch.zeros(3).double())
+    end = simulator(60, gravity=(0.0, 0.0, 0.0)).run(state, elastic(), 10, [10]).positions[0]
     np.testing.assert_allclose(end.numpy(), x.numpy(), atol=1e-12)
 
 

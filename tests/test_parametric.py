@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from masiv.errors import MasivError, NonFiniteError
-from masiv.identify.parametric import Parameter, fit_parameters
+from masiv.inference.least_squares import Parameter, fit_parameters
 
 TIMES = np.linspace(0, 2, 200)
 

@@ -14,11 +14,11 @@ from masiv.identify import polish
 from masiv.identify.fit import Fit, fit_from, fit_state
 from masiv.identify.objective import objective
 from masiv.identify.pictures import some_of_each
-from masiv.identify.problem import Motion, Problem
 from masiv.identify.stage import identify
 from masiv.identify.throw import Throw
 from masiv.materials.load import load_law
 from masiv.materials.pretrain import pretrained_path
+from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Frame
 from masiv.splat.rasteriser import render
@@ -52,9 +52,9 @@ def problem_of(filmed, seen, **changes):  # noqa: F811
     return Problem(filmed, seen[0], config, SimulatorConfig())
 
 
-def thrown(problem, error):
+def rigid_initial_state(problem, error):
     velocity = VELOCITY + np.array([error, 0.0, 0.0])
-    return Fit(load_law(pretrained_path("jelly")), (Motion.of_world(problem.axes, velocity, OMEGA),))
+    return Fit(load_law(pretrained_path("jelly")), (InitialState.of_world(problem.axes, velocity, OMEGA),))
 
 
 def polished(problem, fitted):
@@ -72,13 +72,13 @@ def picture_sum(problem, report, name):
 
 def test_surfaces_correct_what_paths_had_wrong_and_silhouettes_refuse_what_they_make_worse(filmed, seen, monkeypatch):  # noqa: F811
     problem = problem_of(filmed, seen, velocity_learning_rate=0.06)
-    wrong = thrown(problem, 0.4)
+    wrong = rigid_initial_state(problem, 0.4)
     better, nearness, first = polished(problem, wrong)
     assert first["silhouette_error_of_surfaces"] < 0.8 * first["silhouette_error_of_paths"]
     assert abs(float(better.motions[0].velocity[0]) - VELOCITY[0]) < 0.2
     assert problem.config.geometry_loss == "trajectory"  # the problem of the paths is as it was
-    monkeypatch.setattr(polish, "fit", lambda *_, **__: thrown(problem, 0.4))
-    right = thrown(problem, 0.0)
+    monkeypatch.setattr(polish, "fit", lambda *_, **__: rigid_initial_state(problem, 0.4))
+    right = rigid_initial_state(problem, 0.0)
     kept, nearer, report = polished(problem, right)
     assert kept is right
     assert nearer == pytest.approx(picture_sum(problem, report, "paths"))
@@ -98,7 +98,7 @@ def test_a_fit_keeps_what_its_whole_objective_likes_best(filmed, seen):  # noqa:
 
 
 def test_a_checkpoint_of_an_older_fit_is_refused_in_a_sentence(filmed, seen):  # noqa: F811
-    state = fit_state(thrown(problem_of(filmed, seen), 0.0))
+    state = fit_state(rigid_initial_state(problem_of(filmed, seen), 0.0))
     del state["objective"]
     with pytest.raises(MasivError, match="delete what is in checkpoints/"):
         fit_from(state, load_law(pretrained_path("jelly")))

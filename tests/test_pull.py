@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from masiv.continuum.carve import VisualHull
+from masiv.hull.carve import VisualHull
 from masiv.splat.pull import HullPull
 
 SPACING = 0.01

@@ -19,7 +19,7 @@ from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.losses import neighbour_pairs, ssim, strain
 from masiv.splat.objective import NAMES, Objective, Part
-from masiv.splat.observe import observe
+from masiv.splat.observed_image import observed_image
 from masiv.splat.rasteriser import render
 from masiv.splat.reconstruct import reconstruct
 from masiv.splat.share import Second
@@ -225,7 +225,7 @@ def test_a_second_process_that_dies_is_told_of_and_none_is_left(scene, monkeypat
 def test_what_the_second_process_cannot_draw_is_told_of(scene):
     """Its objective alone is broken: the picture that it is given has a camera of no number."""
     nowhere = dataclasses.replace(scene.cameras[0], world_to_camera=np.full((4, 4), np.nan))
-    seen = dataclasses.replace(observe(scene, 0, 0, crop_side=40, crop_padding=4), camera=nowhere)
+    seen = dataclasses.replace(observed_image(scene, 0, 0, crop_side=40, crop_padding=4), camera=nowhere)
     objective = Objective(CONFIG, 0.01, 0.2, FPS, None, (), [[seen]])
     gaussians = {n: torch.zeros(4, *s) for n, s in zip(NAMES, ((3,), (), (), (3,)), strict=True)}
     network = DeformationNetwork(
@@ -288,8 +288,8 @@ def test_result_round_trip(result, tmp_path):
 
 def test_averaged_crop_shows_the_same_points(scene):
     """Halving the picture halves the pixel coordinates, counted from the crop's corner."""
-    whole = observe(scene, 1, 0, crop_side=40, crop_padding=3)
-    half = observe(scene, 1, 0, crop_side=16, crop_padding=3)
+    whole = observed_image(scene, 1, 0, crop_side=40, crop_padding=3)
+    half = observed_image(scene, 1, 0, crop_side=16, crop_padding=3)
     assert whole.colour.shape[:2] == (whole.camera.height, whole.camera.width)
     assert half.camera.width < whole.camera.width
     points = truth(ball(5)[0], 0)
@@ -314,8 +314,8 @@ def test_occluded_pixels_neither_count_nor_darken(scene):
         image = np.where(valid[..., None], picture.image, 0).astype(np.uint8)
         return Frame(image, picture.mask, valid)
 
-    hidden = observe(dataclasses.replace(scene, load=load, _cache={}), 1, 0, crop_side=16, crop_padding=3)
-    open_ = observe(scene, 1, 0, crop_side=16, crop_padding=3)
+    hidden = observed_image(dataclasses.replace(scene, load=load, _cache={}), 1, 0, crop_side=16, crop_padding=3)
+    open_ = observed_image(scene, 1, 0, crop_side=16, crop_padding=3)
     inside = (open_.mask > 0.999) & (hidden.valid > 0)
     assert hidden.valid.max() < 0.8
     assert (hidden.colour - open_.colour)[inside].abs().mean() < 0.05

@@ -11,22 +11,22 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import Setting
+from masiv.effects.effect import EffectContext
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.parametric import Parameter
+from masiv.inference.least_squares import Parameter
+from masiv.inference.model_fit import clipped_step
+from masiv.inference.noise_floor import noise_floor
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import rollout
-from masiv.mpm.simulate import thrown
 from masiv.mpm.simulator import Simulator
+from masiv.observations.motion import SampledMotion
 from masiv.refine.config import RefineConfig
-from masiv.refine.noise import noise_floor
-from masiv.refine.observed import SampledMotion
-from masiv.refine.refit import moved
 from masiv.refine.stage import Throw, refine, split_frames
 from masiv.refine.summary import summary
 from masiv.scene.scene import Ground, Scene
+from masiv.simulation.simulate import rigid_initial_state
 
 pytestmark = pytest.mark.usefixtures("taichi")
 FPS, FRAMES, FITTED = 24.0, 14, 10
@@ -53,13 +53,14 @@ def observed(effects, noise_m=3e-4, velocity=VELOCITY, omega=OMEGA):
     steps = 48
     simulator = Simulator(particle_count=COUNT, spacing=(6 * SIDE**3 / COUNT) ** (1 / 3), substep=1 / (FPS * steps),
                           volume=SIDE**3, density=1000.0, gravity=(0.0, -9.8, 0.0), max_substeps=512)  # fmt: skip
-    setting = Setting(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * SIDE**3 / COUNT, SIDE, FRAMES / FPS)
+    setting = EffectContext(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * SIDE**3 / COUNT, SIDE, FRAMES / FPS)
     members = tuple((effect_named(name), torch.tensor(values)) for name, values in effects.items())
     law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
     outputs = [k * steps for k in range(1, FRAMES)]
     with torch.no_grad():
-        path = rollout(simulator, law, thrown(start, torch.tensor(velocity), torch.tensor(omega)), outputs[-1],
-                       outputs, ActiveEffects(members, setting) if members else None)  # fmt: skip
+        state = rigid_initial_state(start, torch.tensor(velocity), torch.tensor(omega))
+        effects = ActiveEffects(members, setting) if members else None
+        path = rollout(simulator, law, state, outputs[-1], outputs, effects)
     positions = np.concatenate([start[None].numpy(), path.numpy()]).astype(np.float64)
     positions[1:] += np.random.default_rng(0).normal(0, noise_m, positions[1:].shape)
     return SampledMotion(positions, np.arange(FRAMES) / FPS, SIDE**3)
@@ -90,7 +91,7 @@ def test_undeclared_drag_is_named_measured_and_confirmed():
         document["after"]["held_out"]["trajectory_rmse_mm"] < document["before"]["held_out"]["trajectory_rmse_mm"] / 3
     )
     assert document["candidates"][0]["explained"] > 0.5
-    assert refined.outcome.after.values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
+    assert refined.result.after.values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
 
 
 def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
@@ -104,7 +105,7 @@ def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
     )
     assert [a["effect"] for a in document["accepted"]] == ["body_force"]
     assert list(document["accepted"][0]["theta"].values()) == pytest.approx([0, 0, 2], abs=0.1)
-    values = refined.outcome.after.values
+    values = refined.result.after.values
     assert values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
     assert values["velocity_x@run1"] == pytest.approx(-0.5, abs=0.05)
     assert len(refined.after) == 2
@@ -154,5 +155,5 @@ def test_held_out_frames_are_the_runs_own_or_the_last_quarter():
 
 def test_steps_stay_within_bounds_and_keep_what_is_not_fitted():
     rate = Parameter("linear_drag.rate", 0.1, 0.0, 20.0, 0.05)
-    out = moved([rate], {"linear_drag.rate": 0.1, "velocity_x@run": 2.0}, np.array([-5.0]))
+    out = clipped_step([rate], {"linear_drag.rate": 0.1, "velocity_x@run": 2.0}, np.array([-5.0]))
     assert out == {"linear_drag.rate": 0.0, "velocity_x@run": 2.0}

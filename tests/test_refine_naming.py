@@ -7,13 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from masiv.refine import naming
+from masiv.refine import selection as naming
 from masiv.refine.answer import answer
 from masiv.refine.config import RefineConfig
 from masiv.refine.rounds import Trial
 
 FITTED, ALL, NOISE = 4, 6, 1e-3
-WATCHED = [SimpleNamespace(noise=NOISE, sigma=np.full(ALL, NOISE), rows=FITTED, holds_out=True, instants=ALL)]
+WATCHED = [
+    SimpleNamespace(noise_std=NOISE, residual_std=np.full(ALL, NOISE), fit_count=FITTED, holds_out=True, time_count=ALL)
+]
 
 
 def trial(effect, fitted, held_out, count=9, passes=True):
@@ -29,7 +31,7 @@ def trial(effect, fitted, held_out, count=9, passes=True):
 @pytest.fixture(autouse=True)
 def apart(monkeypatch):
     """Told apart by ten sigmas for each noise of mean square."""
-    monkeypatch.setattr(naming, "told_apart", lambda a, b, _: 10 * (b.cost - a.cost))
+    monkeypatch.setattr(naming, "vuong_z", lambda a, b, _: 10 * (b.cost - a.cost))
 
 
 def named(*trials):

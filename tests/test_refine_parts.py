@@ -12,29 +12,36 @@ from test_refine import VELOCITY
 from test_workers import small_simulation
 
 from masiv.errors import MasivError
-from masiv.identify.families import FAMILIES
-from masiv.identify.parametric import Parameter
-from masiv.refine import second_look
+from masiv.inference.discretization import with_grid_errors, with_residual_std
+from masiv.inference.least_squares import Parameter
+from masiv.inference.model_fit import ModelFit, best_strength, column, gauss_newton_jump, strengths_alone
+from masiv.models.base import EffectTerm, WeightedResidual
+from masiv.models.families import FAMILIES
+from masiv.models.free_body import Model, Simulation
+from masiv.refine import second_effect
 from masiv.refine.add_effect import absent
+from masiv.refine.candidates import score
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import excess, explains_too_little, foretold, objections, sigmas_from_zero, simplest
-from masiv.refine.grids import weighed, with_grid_errors
-from masiv.refine.loop import in_reach
-from masiv.refine.model import Model, Simulation
-from masiv.refine.refit import Fitted, best_strength, column, leapt, strengths_alone
-from masiv.refine.score import score
-from masiv.refine.simulated import Term, Weighing
+from masiv.refine.evidence import (
+    explains_too_little,
+    log_predictive_gain,
+    objections,
+    reduced_chi,
+    sigmas_from_zero,
+    simplest,
+)
+from masiv.refine.search import could_improve
 
 INSTANTS, ROWS, POINTS = 6, 4, 5
 NOISE = 1e-3
 
 
 @dataclass(frozen=True)
-class Watched(Weighing):
-    noise: float = NOISE
-    sigma: np.ndarray = None
-    instants: int = INSTANTS
-    rows: int = ROWS
+class Observation(WeightedResidual):
+    noise_std: float = NOISE
+    residual_std: np.ndarray = None
+    time_count: int = INSTANTS
+    fit_count: int = ROWS
     holds_out: bool = True
     grid_changes: tuple[np.ndarray, ...] = ()
 
@@ -44,7 +51,7 @@ class Linear:
 
     def __init__(self, matrix, target, *changes):
         self.matrix, self.target, self.changes = matrix, target, changes
-        self.experiments = (Watched(sigma=np.full(INSTANTS, NOISE)),)
+        self.observations = (Observation(residual_std=np.full(INSTANTS, NOISE)),)
 
     def residual(self, model, values):
         return self.matrix @ np.array([values["a"], values["b"]]) - self.target
@@ -63,8 +70,8 @@ def test_a_leap_ends_in_the_minimum_however_far_and_within_bounds():
     for truth, found in (([40.0, -7.0], [40.0, -7.0]), ([3.0, 50.0], None)):
         simulation = Linear(matrix, matrix @ np.array(truth))
         start = {"a": 0.0, "b": 0.0}
-        values, residual, jacobian = leapt(
-            simulation, None, parameters(), start, simulation.residual(None, start), matrix, soft=1e6
+        values, residual, jacobian = gauss_newton_jump(
+            simulation, None, parameters(), start, simulation.residual(None, start), matrix, robust_scale=1e6
         )
         np.testing.assert_allclose(residual, simulation.residual(None, values))
         if found is not None:
@@ -77,7 +84,7 @@ def test_a_leap_ends_in_the_minimum_however_far_and_within_bounds():
 def test_strengths_are_found_with_the_rest_as_it_is():
     matrix = np.random.default_rng(1).normal(size=(30, 2))
     simulation = Linear(matrix, matrix @ np.array([5.0, 1.5]))
-    values = strengths_alone(simulation, None, {"a": 5.0, "b": -30.0}, parameters()[1:], soft=1e6)
+    values = strengths_alone(simulation, None, {"a": 5.0, "b": -30.0}, parameters()[1:], robust_scale=1e6)
     assert values["a"] == 5.0
     assert values["b"] == pytest.approx(1.5, rel=2e-3)
 
@@ -88,7 +95,7 @@ def test_a_strength_whose_effect_begins_late_is_found_by_trying():
             return np.full(6, max(values["b"] - 3.0, 0.0) - 5.0)
 
     strengths = [Parameter("b", 0.0, 0.0, 20.0, 1e-3)]
-    values, cost = best_strength(Kinked(np.eye(2), 0.0), None, {"a": 1.0, "b": 2.0}, strengths, soft=1e6)
+    values, cost = best_strength(Kinked(np.eye(2), 0.0), None, {"a": 1.0, "b": 2.0}, strengths, robust_scale=1e6)
     assert values == {"a": 1.0, "b": 8.0}
     assert cost == pytest.approx(0.0, abs=1e-9)
 
@@ -96,10 +103,10 @@ def test_a_strength_whose_effect_begins_late_is_found_by_trying():
 def test_an_effect_begins_with_what_stood_for_it():
     height = Parameter("ground_height.height", 0.0, -0.3, 0.3, 1e-3)
     names = ("ground_offset@a", "ground_offset@b")
-    term = Term("ground_height", "ground_height", (height,), (), ((),), {}, stands_for=names)
+    term = EffectTerm("ground_height", "ground_height", (height,), (), ((),), {}, replaces_parameter=names)
     start = absent(term, {"ground_offset@a": 0.02, "ground_offset@b": 0.03, "velocity_x@a": 1.0})
     assert start == {"ground_height.height": 0.025, **dict.fromkeys(names, 0.0), "velocity_x@a": 1.0}
-    plain = Term("linear_drag", "linear_drag", (replace(height, name="linear_drag.rate"),), (), ((),), {})
+    plain = EffectTerm("linear_drag", "linear_drag", (replace(height, name="linear_drag.rate"),), (), ((),), {})
     assert absent(plain, {"velocity_x@a": 1.0}) == {"linear_drag.rate": 0.0, "velocity_x@a": 1.0}
 
 
@@ -114,27 +121,29 @@ def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
     fitted = SimpleNamespace(jacobian=jacobian, model=None, values={}, parameters=parameters())
 
     def found(*changes, fitted=fitted):
-        (experiment,) = weighed(Linear(jacobian, 0.0, *changes), fitted, [np.full(INSTANTS, NOISE)])
-        return experiment
+        (observation,) = with_residual_std(Linear(jacobian, 0.0, *changes), fitted, [np.full(INSTANTS, NOISE)])
+        return observation
 
-    np.testing.assert_allclose(found(absorbed, 2 * absorbed).sigma, NOISE, rtol=1e-6)
+    np.testing.assert_allclose(found(absorbed, 2 * absorbed).residual_std, NOISE, rtol=1e-6)
     common, apart = 3e-2 * random.normal(size=shape), 1e-2 * random.normal(size=shape)
     alike = found(common, 1.2 * common + absorbed)
-    np.testing.assert_allclose(alike.sigma, NOISE, rtol=1e-6)
+    np.testing.assert_allclose(alike.residual_std, NOISE, rtol=1e-6)
     np.testing.assert_array_equal(alike.grid_changes, [common, 1.2 * common + absorbed])
     differing = found(common + apart, common - apart)
     rms = np.sqrt((apart**2).sum(2).mean(1))
     # A third grid is off the mean of two by the square root of three times as much as they are.
-    assert (np.sqrt(differing.sigma**2 - NOISE**2)[:ROWS] >= 0.8 * np.sqrt(3) * rms[:ROWS]).all()
-    assert (differing.sigma <= 3 * np.maximum.accumulate(rms) + NOISE).all()
-    assert (np.diff(differing.sigma) >= 0).all()
+    assert (np.sqrt(differing.residual_std**2 - NOISE**2)[:ROWS] >= 0.8 * np.sqrt(3) * rms[:ROWS]).all()
+    assert (differing.residual_std <= 3 * np.maximum.accumulate(rms) + NOISE).all()
+    assert (np.diff(differing.residual_std) >= 0).all()
     # What an earlier mean had absorbed does not count.
     columns = np.concatenate([apart[:ROWS].reshape(-1, 1), jacobian], axis=1)
     share = Parameter("grid_change@0", 0.0, -1.0, 3.0, 0.25)
     again = SimpleNamespace(jacobian=columns, model=None, values={}, parameters=[share, *parameters()])
-    np.testing.assert_array_equal(found(common + apart, common - apart, fitted=again).sigma, differing.sigma)
+    np.testing.assert_array_equal(
+        found(common + apart, common - apart, fitted=again).residual_std, differing.residual_std
+    )
     assert found().grid_changes == ()
-    np.testing.assert_array_equal(found().sigma, NOISE)
+    np.testing.assert_array_equal(found().residual_std, NOISE)
 
 
 def test_standard_errors_hold_what_one_more_grid_would_move():
@@ -149,10 +158,10 @@ def test_standard_errors_hold_what_one_more_grid_would_move():
     columns = np.concatenate([common[:ROWS].reshape(-1, 1), jacobian], axis=1)
     params = [share, parameters()[0], Parameter("b", 1.0, 0.1, 9.0, 1e-3, log=True)]
     errors = dict(zip(values, (0.1, 0.01, 0.02), strict=True))
-    fitted = Fitted(None, values, tuple(params), np.zeros(len(jacobian)), columns, 1.0, 9, 1.0, 1.0, [], errors)
+    fitted = ModelFit(None, values, tuple(params), np.zeros(len(jacobian)), columns, 1.0, 9, 1.0, 1.0, [], errors)
     assert with_grid_errors(simulation, fitted, 1.0) is fitted  # no grid is known to change anything
     changes = (common + apart, common - apart)
-    simulation.experiments = (replace(simulation.experiments[0], grid_changes=changes),)
+    simulation.observations = (replace(simulation.observations[0], grid_changes=changes),)
     found = with_grid_errors(simulation, fitted, 1.0).stderr
     # The mean's own size is what its share is for; a third grid is off it by the square root of three times as much.
     assert found[share.name] == pytest.approx(errors[share.name])
@@ -166,9 +175,9 @@ def fits(*levels, count=3):
     return SimpleNamespace(squares=[squares], parameters=[None] * count, values=dict.fromkeys(range(count)))
 
 
-def judged(before, after, sigma=NOISE, adapts=True, sure=None):
-    experiments = [Watched(sigma=np.full(INSTANTS, sigma))]
-    return explains_too_little(before, after, experiments, RefineConfig(), adapts=adapts, sure=lambda: sure)
+def judged(before, after, residual_std=NOISE, adapts=True, sure=None):
+    observations = [Observation(residual_std=np.full(INSTANTS, residual_std))]
+    return explains_too_little(before, after, observations, RefineConfig(), adapts=adapts, sure=lambda: sure)
 
 
 def test_evidence():
@@ -196,24 +205,26 @@ def test_evidence():
     assert judged(fits(2.6, 2.0), fits(1.4, 1.3), adapts=False) == []
     assert "held-out" in judged(fits(1.6, 2.0), fits(1.2, 2.0), adapts=False)[-1]
     # Nothing is plain where the simulation is nowhere as certain as the observation.
-    assert "held-out" in judged(fits(36, 80), fits(8, 80), sigma=2 * NOISE)[0]
+    assert "held-out" in judged(fits(36, 80), fits(8, 80), residual_std=2 * NOISE)[0]
 
 
 def test_held_out_instants_are_one_sample_of_the_criterion():
-    experiments = [Watched(sigma=np.full(INSTANTS, NOISE))]
-    assert foretold(fits(2, 6), fits(1, 2), experiments) == pytest.approx(math.log(3))
-    assert foretold(fits(2, 6), fits(1, 0.1), experiments) == pytest.approx(math.log(6))  # noise alone is not foretold
-    assert foretold(fits(2, 2), fits(1, 6), experiments) == pytest.approx(-math.log(3))
-    assert foretold(fits(2, 6), fits(1, 2), [replace(experiments[0], holds_out=False)]) == 0.0
+    observations = [Observation(residual_std=np.full(INSTANTS, NOISE))]
+    assert log_predictive_gain(fits(2, 6), fits(1, 2), observations) == pytest.approx(math.log(3))
+    assert log_predictive_gain(fits(2, 6), fits(1, 0.1), observations) == pytest.approx(
+        math.log(6)
+    )  # noise alone is not foretold
+    assert log_predictive_gain(fits(2, 2), fits(1, 6), observations) == pytest.approx(-math.log(3))
+    assert log_predictive_gain(fits(2, 6), fits(1, 2), [replace(observations[0], holds_out=False)]) == 0.0
     rate = Parameter("linear_drag.rate", 0.1, 0.0, 10.0, 0.1)
-    term = Term("linear_drag", "linear_drag", (rate,), (), ((),), {})
+    term = EffectTerm("linear_drag", "linear_drag", (rate,), (), ((),), {})
 
     def objected(gain, was, now):
         before, after = fits(9, was), fits(1, now)
         for found, criterion in ((before, 0.0), (after, -gain)):
             found.bic, found.samples, found.jacobian = lambda samples, c=criterion: c, 100, np.ones((4, 1))
             found.parameters, found.values, found.stderr = [rate], {rate.name: 1.0}, {rate.name: 0.1}
-        return " ".join(objections(before, after, term, experiments, RefineConfig.model_validate({})))
+        return " ".join(objections(before, after, term, observations, RefineConfig.model_validate({})))
 
     assert objected(5.4, 6, 2) == ""
     assert "falls by 5.5, less than 6" in objected(5.4, 2.2, 2)
@@ -222,9 +233,11 @@ def test_held_out_instants_are_one_sample_of_the_criterion():
 
 def test_a_second_cause_is_confirmed_and_both_are_certain():
     rate = Parameter("linear_drag.rate", 0.1, 0.0, 10.0, 0.1)
-    term = Term("linear_drag", "linear_drag", (rate,), (), ((),), {})
+    term = EffectTerm("linear_drag", "linear_drag", (rate,), (), ((),), {})
     simulation = SimpleNamespace(
-        term=lambda name: term, objections=lambda *_: [], experiments=[Watched(sigma=np.full(INSTANTS, NOISE))]
+        term=lambda name: term,
+        objections=lambda *_: [],
+        observations=[Observation(residual_std=np.full(INSTANTS, NOISE))],
     )
 
     def pair(gain, held_out, sigmas=5.0):
@@ -236,7 +249,7 @@ def test_a_second_cause_is_confirmed_and_both_are_certain():
 
     def objected(gain, was, now, **more):
         config = RefineConfig.model_validate({})
-        return " ".join(second_look.objections(simulation, pair(0.0, was), pair(gain, now, **more), config))
+        return " ".join(second_effect.objections(simulation, pair(0.0, was), pair(gain, now, **more), config))
 
     assert objected(15, 4.0, 1.8) == ""  # held-out frames confirm it
     assert "asked: 30 %" in objected(15, 4.0, 2.5)
@@ -267,21 +280,21 @@ def test_a_strength_counts_with_its_place_held():
 
 
 def test_of_causes_that_explain_as_much_thesimplest():
-    experiments = [Watched(sigma=np.full(INSTANTS, NOISE))]
+    observations = [Observation(residual_std=np.full(INSTANTS, NOISE))]
     rich, plain, poor = (fits(1.0, 1, count=9), fits(1.1, 1, count=4), fits(3, 1, count=2))
-    assert simplest([rich, plain, poor], experiments) is plain
-    assert simplest([], experiments) is None
-    uncertain = [replace(experiments[0], sigma=np.full(INSTANTS, 10 * NOISE))]
+    assert simplest([rich, plain, poor], observations) is plain
+    assert simplest([], observations) is None
+    uncertain = [replace(observations[0], residual_std=np.full(INSTANTS, 10 * NOISE))]
     assert simplest([rich, plain, poor], uncertain) is poor
-    assert excess(fits(9, 1), experiments) == pytest.approx(3.0)
+    assert reduced_chi(fits(9, 1), observations) == pytest.approx(3.0)
 
 
 def test_a_worse_law_is_not_fitted_with_what_would_not_make_up_for_it():
     base = SimpleNamespace(cost=2.0)
     trials = [SimpleNamespace(fitted=SimpleNamespace(cost=c)) for c in (1.5, 1.8)]
-    assert in_reach(SimpleNamespace(explained=0.2), base, trials)
-    assert not in_reach(SimpleNamespace(explained=0.1), base, trials)
-    assert in_reach(SimpleNamespace(explained=0.1), base, [])
+    assert could_improve(SimpleNamespace(explained=0.2), base, trials)
+    assert not could_improve(SimpleNamespace(explained=0.1), base, trials)
+    assert could_improve(SimpleNamespace(explained=0.1), base, [])
 
 
 def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
@@ -292,45 +305,49 @@ def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
         flight: int = 3
 
         @property
-        def rows(self):
+        def fit_count(self):
             return (self.fitted - 1) * self.problem.samples
 
     simulation = Simulation([Throw(SimpleNamespace(size=0.5, samples=2))])
     near = np.full(30, 1e-6)
-    assert simulation.early(SimpleNamespace(squares=[near])) == []
+    assert simulation.curriculum(SimpleNamespace(squares=[near])) == []
     away = np.where(np.arange(30) < 12, near, 0.2**2)  # at the end of frame 6, all is well
-    assert [s.experiments[0].fitted for s in simulation.early(SimpleNamespace(squares=[away]))] == [9, 10]
+    assert [s.observations[0].fitted for s in simulation.curriculum(SimpleNamespace(squares=[away]))] == [9, 10]
     # A fit that gives up the flight for what comes after it shows at once, which is no sign of when that was.
     everywhere = np.full(30, 0.2**2)
     for flight, horizons in ((3, [6, 9]), (6, [9, 10])):
-        simulation = Simulation([replace(simulation.experiments[0], flight=flight)])
-        assert [s.experiments[0].fitted for s in simulation.early(SimpleNamespace(squares=[everywhere]))] == horizons
+        simulation = Simulation([replace(simulation.observations[0], flight=flight)])
+        assert [
+            s.observations[0].fitted for s in simulation.curriculum(SimpleNamespace(squares=[everywhere]))
+        ] == horizons
 
 
 @pytest.mark.usefixtures("taichi")
 def test_first_moments_begin_with_the_throw_of_free_flight():
     simulation, _ = small_simulation()
-    begun = simulation.begun({"youngs_modulus": 1e4, "velocity_x@run": 9.0, "linear_drag.rate": 0.5})
-    assert begun.pop("velocity_x@run") == pytest.approx(VELOCITY[0], abs=0.3)  # drag acts, too
-    assert begun == {"youngs_modulus": 1e4, "linear_drag.rate": 0.5}
+    reset_initial_conditions = simulation.reset_initial_conditions(
+        {"youngs_modulus": 1e4, "velocity_x@run": 9.0, "linear_drag.rate": 0.5}
+    )
+    assert reset_initial_conditions.pop("velocity_x@run") == pytest.approx(VELOCITY[0], abs=0.3)  # drag acts, too
+    assert reset_initial_conditions == {"youngs_modulus": 1e4, "linear_drag.rate": 0.5}
 
 
 @pytest.mark.usefixtures("taichi")
 def test_a_law_that_few_particles_can_take_finer_grids_can_take_too():
-    (experiment,) = small_simulation()[0].experiments
+    (observation,) = small_simulation()[0].observations
 
     def law(modulus):
         return SimpleNamespace(wave_modulus=lambda: modulus)
 
     def possible(modulus):
         try:
-            return experiment.problem.least_substeps(law(modulus)) > 0
+            return observation.problem.least_substeps(law(modulus)) > 0
         except MasivError:
             return False
 
     stiffest = max(filter(possible, np.geomspace(1e3, 1e8, 200)))
-    needed = [finer.least_substeps(law(stiffest)) for finer in experiment.finer]
-    assert max(needed) > experiment.problem.simulator.max_substeps_per_frame
+    needed = [finer.least_substeps(law(stiffest)) for finer in observation.finer]
+    assert max(needed) > observation.problem.simulator.max_substeps_per_frame
 
 
 @pytest.mark.usefixtures("taichi")
@@ -339,15 +356,15 @@ def test_a_model_has_a_share_of_what_finer_grids_change():
     model = Model(FAMILIES["neo_hookean"], "sticky")
     values = {p.name: p.start for p in simulation.parameters(model)}
     (without,) = simulation.fields(model, values)
-    change = np.random.default_rng(0).normal(size=(simulation.experiments[0].instants, *without.shape[1:]))
-    simulation.experiments = (replace(simulation.experiments[0], grid_changes=(0.9 * change, 1.1 * change)),)
+    change = np.random.default_rng(0).normal(size=(simulation.observations[0].time_count, *without.shape[1:]))
+    simulation.observations = (replace(simulation.observations[0], grid_changes=(0.9 * change, 1.1 * change)),)
     share = simulation.parameters(model)[0]
     assert (share.name, share.start) == ("grid_change@run", 0.0)
     rolled = simulation.rollouts
     residual = simulation.residual(model, values)
     derivative = column(simulation, model, {**values, share.name: 0.0}, residual, share)
     assert simulation.rollouts == rolled  # nothing else moves
-    expected = simulation.experiments[0].weighted(change[: len(without)]).ravel()
+    expected = simulation.observations[0].whiten(change[: len(without)]).ravel()
     np.testing.assert_allclose(derivative, expected, rtol=1e-9, atol=1e-12)
     (whole,) = simulation.fields(model, {**values, share.name: 0.5}, held_out=True)
     np.testing.assert_allclose(whole[: len(without)], without + 0.5 * change[: len(without)], atol=1e-12)
@@ -359,11 +376,11 @@ def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():
     class Kinked:
         """Nothing below a slipperiness of 1, more and more above it; 5 is true."""
 
-        def lost(self, base):
+        def is_out_of_phase(self, base):
             return False
 
         def term(self, name):
-            return Term(name, name, (Parameter("a", 0.0, 0.0, 100.0, 0.5),), (), ((),), {}, kinked=True)
+            return EffectTerm(name, name, (Parameter("a", 0.0, 0.0, 100.0, 0.5),), (), ((),), {}, nonsmooth=True)
 
         def residual(self, model, values):
             return shape * (max(values["a"] - 1.0, 0.0) - 4.0)
@@ -372,6 +389,6 @@ def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():
         residual=-4.0 * shape, jacobian=np.ones((40, 1)), parameters=parameters()[:1], values={"a": 0.0}, samples=40,
         model=SimpleNamespace(effects=(), with_effect=lambda name: None),
     )  # fmt: skip
-    (found,) = score(Kinked(), base, soft=1e6, names=["slide"])
+    (found,) = score(Kinked(), base, robust_scale=1e6, names=["slide"])
     assert found.explained == pytest.approx(1.0, abs=1e-6)
     assert 3.0 < found.theta["a"] < 9.0

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from masiv.identify.parametric import Parameter
+from masiv.inference.least_squares import Parameter
+from masiv.inference.model_fit import gauss_newton_fit, robust_cost
+from masiv.models.base import EffectTerm, WeightedResidual
+from masiv.models.free_body import Model
 from masiv.refine.add_effect import refit
-from masiv.refine.model import Model
-from masiv.refine.refit import full_fit, robust_cost
-from masiv.refine.score import score
-from masiv.refine.simulated import Term, Weighing
+from masiv.refine.candidates import score
 
 TIMES = np.linspace(0, 0.6, 60)
 BARE, LOAD = 7.7, 2.2
@@ -21,13 +21,13 @@ AXES = np.eye(3)
 
 
 @dataclass(frozen=True)
-class Seen(Weighing):
-    sigma: np.ndarray
-    places: np.ndarray
-    noise: float = 1e-5
+class Seen(WeightedResidual):
+    residual_std: np.ndarray
+    points: np.ndarray
+    noise_std: float = 1e-5
     name: str = "a"
-    instants: int = len(TIMES)
-    rows: int = len(TIMES)
+    time_count: int = len(TIMES)
+    fit_count: int = len(TIMES)
     holds_out: bool = False
 
 
@@ -37,7 +37,7 @@ class Swing:
 
     def __init__(self, out_of_phase):
         self.out_of_phase = out_of_phase
-        self.experiments = (Seen(np.full(len(TIMES), 1e-5), np.zeros((2, 3))),)
+        self.observations = (Seen(np.full(len(TIMES), 1e-5), np.zeros((2, 3))),)
         self.observed = self.motion({"mass.mass": LOAD, "mass.place": 1.0})
 
     def motion(self, values):
@@ -56,9 +56,9 @@ class Swing:
     def term(self, name):
         if name == "push":
             own = tuple(Parameter(f"push.{axis}", 0.0, -100.0, 100.0, 0.1) for axis in "xy")
-            return Term(name, name, own, (), ((),), {})
+            return EffectTerm(name, name, own, (), ((),), {})
         own = Parameter("mass.mass", 0.0, 0.0, 100.0, 0.05), Parameter("mass.place", 0.5, 0.0, 1.0, 0.02)
-        return Term(name, name, own[:1], own[1:], ((0.15,), (0.5,), (0.9,), (1.0,)), {})
+        return EffectTerm(name, name, own[:1], own[1:], ((0.15,), (0.5,), (0.9,), (1.0,)), {})
 
     def candidates(self, model):
         return ["mass", "push"]
@@ -69,19 +69,19 @@ class Swing:
     def residual(self, model, values):
         return self.fields(model, values)[0].ravel()
 
-    def lost(self, base):
+    def is_out_of_phase(self, base):
         return self.out_of_phase
 
 
 def base_of(simulation):
-    return full_fit(simulation, Model(None, "none"), {}, budget=4, soft=1.0)
+    return gauss_newton_fit(simulation, Model(None, "none"), {}, budget=4, robust_scale=1.0)
 
 
 def test_out_of_phase_a_cause_is_ranked_by_what_it_does_at_finite_strength():
     simulation = Swing(out_of_phase=True)
     base = base_of(simulation)
     assert base.parameters == ()  # nothing to fit is a fit, too
-    first, second = score(simulation, base, soft=1.0)
+    first, second = score(simulation, base, robust_scale=1.0)
     assert (first.effect, second.effect) == ("mass", "push")
     tried = {**base.values, **first.theta}
     assert 1 - first.explained == pytest.approx(robust_cost(simulation.residual(None, tried), 1.0) / base.cost)
@@ -92,7 +92,7 @@ def test_out_of_phase_a_cause_is_ranked_by_what_it_does_at_finite_strength():
     assert fitted.fit_mm < 0.05 * base.fit_mm
     # From none, on the derivative there, it is not found.
     linear = Swing(out_of_phase=False)
-    about_none = next(c for c in score(linear, base, soft=1.0) if c.effect == "mass")
+    about_none = next(c for c in score(linear, base, robust_scale=1.0) if c.effect == "mass")
     assert refit(linear, base, about_none, 1.0).fit_mm > 4 * fitted.fit_mm
     assert refit(simulation, base, second, 1.0).fit_mm > 4 * fitted.fit_mm
 
@@ -113,13 +113,13 @@ class Saturating(Swing):
 
     def term(self, name):
         own = Parameter("mass.mass", 0.0, 0.0, 100.0, 0.01), Parameter("mass.place", 0.5, 0.0, 1.0, 1e-3)
-        return Term(name, name, own[:1], own[1:], ((0.0,), (1.0,)), {})
+        return EffectTerm(name, name, own[:1], own[1:], ((0.0,), (1.0,)), {})
 
 
 def test_a_cause_that_falls_short_of_its_promise_is_begun_elsewhere():
     simulation = Saturating()
     base = base_of(simulation)
-    (found,) = score(simulation, base, soft=1.0, names=["mass"])
+    (found,) = score(simulation, base, robust_scale=1.0, names=["mass"])
     assert found.theta["mass.place"] == 0.0
     assert [c.theta["mass.place"] for c in found.rivals] == [1.0]
     fitted = refit(simulation, base, found, 1.0)
@@ -133,8 +133,10 @@ def test_what_the_base_left_at_a_guess_stays_there_beside_a_further_cause(out_of
     simulation.observed = simulation.motion({"mass.mass": LOAD, "mass.place": 1.0, "push.x": 3.0})
     model = Model(None, "none", ("mass",))
     held = frozenset({"mass.place"})
-    base = full_fit(simulation, model, {"mass.mass": LOAD, "mass.place": 1.0}, budget=8, soft=1.0, held=held)
-    (push,) = score(simulation, base, soft=1.0, names=["push"])
+    base = gauss_newton_fit(
+        simulation, model, {"mass.mass": LOAD, "mass.place": 1.0}, budget=8, robust_scale=1.0, held=held
+    )
+    (push,) = score(simulation, base, robust_scale=1.0, names=["push"])
     fitted = refit(simulation, base, push, 1.0)
     assert fitted.values["mass.place"] == 1.0
     assert {p.name for p in fitted.parameters} == {"mass.mass", "push.x", "push.y"}

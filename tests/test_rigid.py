@@ -6,9 +6,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import Setting
-from masiv.refine.noise import noise_floor
-from masiv.rigid import beyond_rigid, beyond_uniform, flown, free_flight, struck, turned_freely
+from masiv.effects.effect import EffectContext
+from masiv.inference.noise_floor import noise_floor
+from masiv.rigid import ballistic_positions, beyond_rigid, beyond_uniform, free_flight, impact_point, turned_freely
 
 GRAVITY = np.array([0.0, -9.8, 0.0])
 VELOCITY, OMEGA = np.array([1.2, 0.4, 0.3]), np.array([0.4, 2.0, 3.0])
@@ -22,7 +22,7 @@ def body():
 
 @pytest.fixture
 def flight(body):
-    return np.stack([flown(body, VELOCITY, OMEGA, GRAVITY, t) for t in TIMES])
+    return np.stack([ballistic_positions(body, VELOCITY, OMEGA, GRAVITY, t) for t in TIMES])
 
 
 def test_a_flight_is_found_from_its_positions(flight):
@@ -45,7 +45,7 @@ def test_a_long_body_wobbles_as_a_symmetric_top():
         own = Rotation.from_rotvec([0, 0, (1 - along / across) * omega[2] * t])
         due = Rotation.from_rotvec(momentum / across * t) * own
         assert (turn * due.inv()).magnitude() < 1e-3
-    flight = np.stack([flown(body, VELOCITY, omega, GRAVITY, t) for t in TIMES])
+    flight = np.stack([ballistic_positions(body, VELOCITY, omega, GRAVITY, t) for t in TIMES])
     np.testing.assert_allclose(free_flight(flight, TIMES, GRAVITY)[1], omega, atol=1e-2)
 
 
@@ -66,7 +66,7 @@ def test_a_body_that_swells_in_flight_is_not_taken_for_noise(flight):
 
 
 def test_a_flight_that_is_turned_aside_shows_where(flight):
-    assert struck(flight, TIMES, GRAVITY) is None
+    assert impact_point(flight, TIMES, GRAVITY) is None
     centre, radius = flight[6].mean(0) + np.array([0.25, 0.0, 0.0]), 0.15
     turned = flight.copy()
     for frame in (6, 7, 8):  # nothing is inside of the sphere
@@ -74,10 +74,12 @@ def test_a_flight_that_is_turned_aside_shows_where(flight):
         distance = np.linalg.norm(arm, axis=1, keepdims=True)
         turned[frame] = centre + arm / distance * np.maximum(distance, radius)
     turned[1:] += 1e-3 * np.random.default_rng(0).normal(size=turned[1:].shape)
-    place = struck(turned, TIMES, GRAVITY)
+    place = impact_point(turned, TIMES, GRAVITY)
     assert np.linalg.norm(place - centre) < 0.6 * radius
 
     guesses = effect_named("hidden_obstacle").guesses(
-        Setting(torch.as_tensor(GRAVITY), torch.as_tensor(flight[0]), 0.1, 0.4, 0.4, 1 / 24, torch.as_tensor(turned))
+        EffectContext(
+            torch.as_tensor(GRAVITY), torch.as_tensor(flight[0]), 0.1, 0.4, 0.4, 1 / 24, torch.as_tensor(turned)
+        )
     )
     np.testing.assert_allclose(guesses[0], place)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from masiv.errors import InputError
-from masiv.scene.read import read_scene
+from masiv.observations.read import read_scene
 
 WIDTH, HEIGHT, FRAMES = 48, 40, 3
 CENTRE = np.array([0.05, 0.6, -0.1])

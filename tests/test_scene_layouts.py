@@ -11,7 +11,7 @@ import pytest
 import tiny_scenes as tiny
 
 from masiv.errors import InputError
-from masiv.scene.read import LAYOUTS, read_scene
+from masiv.observations.read import LAYOUTS, read_scene
 from masiv.scene.summary import as_text, summarise
 
 WRITERS = {

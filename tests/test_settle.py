@@ -9,11 +9,11 @@ import pytest
 from ring_scene import look_at, pixel_rays, spheres_scene
 from scipy.spatial import cKDTree
 
-from masiv.continuum.carve import visual_hull
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.fill import fill_volume
-from masiv.continuum.settle import VOLUME_SLACK, settled, settled_hull
-from masiv.continuum.silhouette import Silhouette, silhouettes
+from masiv.hull.carve import visual_hull
+from masiv.hull.settle import VOLUME_SLACK, settled, settled_hull
+from masiv.hull.silhouette import Silhouette, silhouettes
 
 RADIUS, THICKNESS = 0.45, 0.08
 BALL = (np.array([0.0, 0.55, 0.0]), (0.75 * RADIUS**2 * THICKNESS) ** (1 / 3))  # as much matter as the disc

@@ -16,11 +16,11 @@ from masiv.materials.load import load_law
 from masiv.materials.neural import strain_invariants
 from masiv.materials.pretrain import pretrained_path
 from masiv.mpm.config import SimulatorConfig
-from masiv.mpm.simulate import Push, simulate
 from masiv.mpm.simulator import Simulator
-from masiv.mpm.variation import with_body_of, with_density, with_ground, with_mesh
 from masiv.report.film import balls
 from masiv.scene.scene import Ground
+from masiv.simulation.simulate import Push, simulate
+from masiv.simulation.variation import with_body_of, with_density, with_ground, with_mesh
 from masiv.twin import Twin
 
 pytestmark = pytest.mark.usefixtures("taichi")

@@ -13,8 +13,8 @@ from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing
-from masiv.mpm.simulate import simulate
-from masiv.mpm.split import PATTERNS, finer, split, wholes
+from masiv.simulation.simulate import simulate
+from masiv.simulation.subdivide import PATTERNS, finer, split, wholes
 from masiv.twin import Twin
 
 SPACING, FRAMES = 0.02, 13
@@ -84,9 +84,9 @@ def test_a_bar_that_cannot_break_does_not():
 @pytest.mark.usefixtures("taichi")
 def test_flight_is_that_of_the_wholes():
     """Without stress, particles and their parts fly alike: the centre by the parabola, to rounding."""
-    thrown = replace(bar(0.0), velocity=np.array([1.0, 2.0, -0.5]), gravity=np.array([0.0, -9.8, 0.0]))
-    motion = simulate(thrown, frames=5, substeps=50)
+    rigid_initial_state = replace(bar(0.0), velocity=np.array([1.0, 2.0, -0.5]), gravity=np.array([0.0, -9.8, 0.0]))
+    motion = simulate(rigid_initial_state, frames=5, substeps=50)
     t = motion.times[:, None]
-    late = t / (50 * thrown.fps)  # symplectic Euler is half a substep ahead
-    exact = thrown.velocity * t + 0.5 * thrown.gravity * (t**2 + late)
-    np.testing.assert_allclose(motion.positions.mean(1) - thrown.positions.mean(0), exact, atol=2e-5)
+    late = t / (50 * rigid_initial_state.fps)  # symplectic Euler is half a substep ahead
+    exact = rigid_initial_state.velocity * t + 0.5 * rigid_initial_state.gravity * (t**2 + late)
+    np.testing.assert_allclose(motion.positions.mean(1) - rigid_initial_state.positions.mean(0), exact, atol=2e-5)

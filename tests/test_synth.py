@@ -10,7 +10,7 @@ import yaml
 from ring_scene import look_at, pixel_rays
 
 from masiv.errors import InputError
-from masiv.scene.read import read_scene
+from masiv.observations.read import read_scene
 from masiv.synth.motion import Skin, simulate
 from masiv.synth.picture import rasterise
 from masiv.synth.shapes import make_body

@@ -32,7 +32,7 @@ from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.pretrain import pretrained_path
 from masiv.mpm.config import SimulatorConfig
-from masiv.mpm.simulate import simulate
+from masiv.simulation.simulate import simulate
 from masiv.twin import Twin
 
 DROP = np.array([-0.3, -2.5, 0.1])

@@ -15,7 +15,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
-from masiv.scene.read import read_observation, read_scene
+from masiv.observations.read import read_observation, read_scene
 from masiv.tracks.placement import best_rigid
 from masiv.tracks.read import read_tracks
 from masiv.tracks.release import found_release

@@ -15,10 +15,10 @@ import yaml
 from masiv.effects.catalogue import effects
 from masiv.errors import MasivError
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.attachment import attach
+from masiv.models.marker_body import fill_geometry, plan, simulated_body, simulated_markers
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.tracks.attach import attach
-from masiv.tracks.body import fill_geometry, plan, simulated_body, simulated_markers
 from masiv.tracks.declaration import GeometryDeclaration
 from masiv.tracks.geometry import make_geometry
 from masiv.tracks.read import read_tracks

@@ -12,10 +12,10 @@ import pytest
 import yaml
 
 from masiv.errors import InputError
+from masiv.models.free_body import Model
+from masiv.models.point_mass import RIGID, PointSimulation, mean_diameter, point_runs
 from masiv.refine.config import RefineConfig
-from masiv.refine.model import Model
-from masiv.tracks.group import refine_group
-from masiv.tracks.points import RIGID, PointSimulation, mean_diameter, point_runs
+from masiv.refine.pooling import refine_group
 from masiv.tracks.read import read_tracks
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -72,13 +72,13 @@ def test_flight_is_that_of_the_closed_form(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.5)}
     tracks = write_scene(tmp_path, balls, noise=0.0)
     simulation = PointSimulation(tracks, point_runs(tracks, "balls"))
-    for run in simulation.experiments:
+    for run in simulation.observations:
         ball = balls[run.body]
         model = Model(RIGID, "none", ("quadratic_drag",) if ball.drag else ())
         values = {"quadratic_drag.drag_coefficient": 0.5}
         members = simulation.members(model, values, run)
         drop = int(run.name[-1])
-        path = simulation.flown(run, members, np.array([[40.0 + drop, -0.3 * drop]]))[0]
+        path = simulation.ballistic_positions(run, members, np.array([[40.0 + drop, -0.3 * drop]]))[0]
         exact = 40 + drop - ball.fallen(run.times, 0.3 * drop)
         assert np.abs(path[:, 0] - exact).max() < (2e-5 if ball.drag else 1e-10)
         if not run.fitted:  # its start is found from its own flight
@@ -88,7 +88,7 @@ def test_flight_is_that_of_the_closed_form(tmp_path):
 def test_one_coefficient_where_all_share_it(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.47), "middle": Ball(0.06, 0.065, 0.47), "light": Ball(0.03, 0.08, 0.47)}
     refined = found(write_scene(tmp_path, balls))
-    after = refined.outcome.after
+    after = refined.result.after
     assert after.model.effects == ("quadratic_drag",)
     name = "quadratic_drag.drag_coefficient"
     assert after.values[name] == pytest.approx(0.47, abs=max(4 * after.stderr[name], 0.005))
@@ -99,16 +99,16 @@ def test_one_coefficient_where_all_share_it(tmp_path):
 def test_own_coefficients_and_a_body_that_lacks_nothing(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "middle": Ball(0.06, 0.065, 0.4), "light": Ball(0.03, 0.08, 0.7)}
     refined = found(write_scene(tmp_path, balls))
-    after = refined.outcome.after
+    after = refined.result.after
     assert sorted(after.model.effects) == ["quadratic_drag@light", "quadratic_drag@middle"]
     for body in ("middle", "light"):
         name = f"quadratic_drag@{body}.drag_coefficient"
         assert after.values[name] == pytest.approx(balls[body].drag, rel=0.03)
     # One gravity of its own a ball would fit as well as drag, nearly; one of all does not.
-    gravity = next(t for t in refined.outcome.rounds[0].trials if t.candidate.effect == "gravity_scale")
+    gravity = next(t for t in refined.result.rounds[0].trials if t.candidate.effect == "gravity_scale")
     assert any("heavy does not share it" in reason for reason in gravity.reasons)
-    assert not any(c.effect.startswith("gravity_scale@") for c in refined.outcome.rounds[0].candidates)
-    linear = next(t for t in refined.outcome.rounds[0].trials if t.candidate.effect == "linear_drag")
+    assert not any(c.effect.startswith("gravity_scale@") for c in refined.result.rounds[0].candidates)
+    linear = next(t for t in refined.result.rounds[0].trials if t.candidate.effect == "linear_drag")
     assert any("it takes a medium of" in reason for reason in linear.reasons)
     [common] = refined.shared
     assert set(common.bodies) == {"middle", "light"}
@@ -118,8 +118,8 @@ def test_own_coefficients_and_a_body_that_lacks_nothing(tmp_path):
 def test_clean_flights_lack_nothing(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.0)}
     refined = found(write_scene(tmp_path, balls))
-    assert refined.outcome.after.model.effects == ()
-    assert refined.simulation.experiments[0].noise == pytest.approx(0.01, rel=0.4)
+    assert refined.result.after.model.effects == ()
+    assert refined.simulation.observations[0].noise_std == pytest.approx(0.01, rel=0.4)
 
 
 def test_what_cannot_be_a_group(tmp_path):
@@ -144,7 +144,7 @@ def test_measured_balls():
     from measured import ball_scene
 
     refined = found(ball_scene(measured_folder()))
-    after = refined.outcome.after
+    after = refined.result.after
     assert sorted(after.model.effects) == [
         "quadratic_drag@Tennis Ball", "quadratic_drag@Whiffle Ball 1", "quadratic_drag@Yellow Whiffle Ball"
     ]  # fmt: skip

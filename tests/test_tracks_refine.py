@@ -16,20 +16,20 @@ from test_tracks_group import Ball, write_scene
 from masiv.cli import main
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
+from masiv.identify.tracks import family_of, fit_law, simulation_of
+from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.cantilever_preload import across, bent
+from masiv.models.clamped_body import BodySimulation
+from masiv.models.free_body import Model
+from masiv.models.marker_body import simulated_body, simulated_markers
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.add_effect import refit
+from masiv.refine.candidates import score
 from masiv.refine.config import RefineConfig
-from masiv.refine.loop import close_loop
-from masiv.refine.model import Model
-from masiv.refine.refit import full_fit
-from masiv.refine.score import score
-from masiv.tracks.bent import across, bent
-from masiv.tracks.body import simulated_body, simulated_markers
+from masiv.refine.search import search_effects
 from masiv.tracks.config import TracksConfig
-from masiv.tracks.fit import family_of, fit_law, simulation_of
 from masiv.tracks.read import read_tracks
-from masiv.tracks.watch import BodySimulation
 
 pytestmark = pytest.mark.usefixtures("taichi")
 YOUNGS, RATIO, VISCOSITY, LOAD = 2e5, 0.2, 150.0, 0.04
@@ -108,14 +108,14 @@ def test_damping_is_found_and_the_law_with_it(bar):
     base = fit_law(simulation, family_of("neo_hookean", 1070, known), TRACKS, quiet)
     assert base.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.15)
     config = RefineConfig(max_effects=1, shortlist=2, unexplained=1e9)  # no stop-gap, which takes long
-    outcome = close_loop(simulation, [base], config, quiet)
-    after = outcome.after
+    result = search_effects(simulation, [base], config, quiet)
+    after = result.after
     assert after.model.effects == ("viscosity",)
     assert after.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.02)
     assert after.values["viscosity.viscosity"] == pytest.approx(VISCOSITY, rel=0.1)
     assert after.held_out_mm < 0.1
-    assert after.held_out_mm < 0.25 * outcome.before.held_out_mm
-    drag = [t for t in outcome.rounds[0].trials if t.candidate.effect == "linear_drag"]
+    assert after.held_out_mm < 0.25 * result.before.held_out_mm
+    drag = [t for t in result.rounds[0].trials if t.candidate.effect == "linear_drag"]
     assert all(any("it takes a medium of" in reason for reason in t.reasons) for t in drag)
 
 
@@ -123,15 +123,15 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
     simulation = only(simulation_of(bar, "load", TRACKS, SIMULATOR, known=known), ("point_mass", "gravity_scale"))
     family = family_of("neo_hookean", 1070, known)
-    base = full_fit(simulation, Model(family, "none", ("viscosity",)), {}, budget=4)
-    assert simulation.early(base)  # its phase is lost
+    base = gauss_newton_fit(simulation, Model(family, "none", ("viscosity",)), {}, budget=4)
+    assert simulation.curriculum(base)  # its phase is lost
     config = RefineConfig(max_effects=1, shortlist=1, unexplained=1e9)
-    outcome = close_loop(simulation, [base], config, quiet)
-    after = outcome.after
+    result = search_effects(simulation, [base], config, quiet)
+    after = result.after
     assert after.model.effects == ("viscosity", "point_mass")
     assert after.values["point_mass.mass"] == pytest.approx(LOAD, rel=0.05)
-    assert after.held_out_mm < 0.2 < 0.1 * outcome.before.held_out_mm
-    share = {c.effect: c.explained for c in outcome.rounds[0].candidates}
+    assert after.held_out_mm < 0.2 < 0.1 * result.before.held_out_mm
+    share = {c.effect: c.explained for c in result.rounds[0].candidates}
     assert 1 - share["point_mass"] < 0.2 * (1 - share["gravity_scale"])
 
 
@@ -162,7 +162,7 @@ def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
     skipped = replace(bar, runs=tuple(replace(run, unsteady=0.05) for run in bar.runs))
     simulation = simulation_of(skipped, "", TRACKS, SIMULATOR, known=known)
-    run = next(r for r in simulation.experiments if not r.fitted)
+    run = next(r for r in simulation.observations if not r.fitted)
     assert run.times[0] >= 0.05
     model = Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",))
     truth = {"release": 3e-3, "aside_1": 4e-4, "aside_2": -3e-4, "above": 1e-3, "lift": -4e-3}
@@ -177,7 +177,7 @@ def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
     np.testing.assert_allclose(markers, seen, atol=1e-5)
     # That of a fitted run is found, too, and not among what is fitted.
     assert not simulation.parameters(model)
-    assert full_fit(simulation, model, {}, budget=4).fit_mm < 0.1
+    assert gauss_newton_fit(simulation, model, {}, budget=4).fit_mm < 0.1
 
 
 def test_load_is_found_where_the_release_is_not_seen(bar):
@@ -187,12 +187,14 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
     simulation = simulation_of(replace(bar, runs=fitted), "load", TRACKS, SIMULATOR, known=known)
     term = simulation.term("point_mass")
     places = tuple(sorted(term.guesses, key=lambda place: place[2]))  # along the bar, from the clamp
-    few = replace(term, guesses=(places[0], places[-1]))
-    simulation.term = lambda name: few if name == "point_mass" else BodySimulation.term(simulation, name)
-    base = full_fit(simulation, Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",)), {}, budget=4)
-    assert simulation.lost(base)
-    assert not simulation.early(base)
-    (found,) = score(simulation, base, soft=1e-3, names=["point_mass"])
+    coarse = replace(term, guesses=(places[0], places[-1]))
+    simulation.term = lambda name: coarse if name == "point_mass" else BodySimulation.term(simulation, name)
+    base = gauss_newton_fit(
+        simulation, Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",)), {}, budget=4
+    )
+    assert simulation.is_out_of_phase(base)
+    assert not simulation.curriculum(base)
+    (found,) = score(simulation, base, robust_scale=1e-3, names=["point_mass"])
     assert found.finite
     after = refit(simulation, base, found, 1e-3)
     assert after.values["point_mass.z"] == places[-1][2]
@@ -202,7 +204,7 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
 
 def test_what_acts_on_the_matter_at_a_place_is_in_the_body(bar):
     simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known={})
-    particles = simulation.experiments[0].body.particles.numpy()
+    particles = simulation.observations[0].body.particles.numpy()
     for name in ("point_mass", "point_force"):
         for p, low, high in zip(simulation.term(name).others, particles.min(0), particles.max(0), strict=True):
             assert (p.lower, p.upper) == pytest.approx((low, high))

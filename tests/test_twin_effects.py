@@ -19,18 +19,18 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.problem import Motion, Problem
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
-from masiv.mpm.simulate import Push, march, simulate, thrown
 from masiv.mpm.simulator import Simulator
-from masiv.mpm.twin_effects import active_effects, body_mass, lowered
-from masiv.mpm.variation import with_body_of, with_density, with_ground
 from masiv.report.page import Page
 from masiv.report.report import _effects_section
 from masiv.runfolder import STAGES
 from masiv.scene.scene import Ground, Scene
+from masiv.simulation.simulate import Push, march, rigid_initial_state, simulate
+from masiv.simulation.twin_effects import active_effects, body_mass, lowered
+from masiv.simulation.variation import with_body_of, with_density, with_ground
 from masiv.twin import Twin, TwinEffect
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -65,7 +65,9 @@ def flying(*effects, **changes):
 
 def test_without_effects_every_bit_is_that_of_bare_rollouts():
     body, frames = twin(), 7
-    state = thrown(*(torch.as_tensor(v, dtype=torch.float32) for v in (body.positions, body.velocity, body.omega)))
+    state = rigid_initial_state(
+        *(torch.as_tensor(v, dtype=torch.float32) for v in (body.positions, body.velocity, body.omega))
+    )
     spacing = grid_spacing(body.volume, len(body.positions), CONFIG)
     bare = [state.position]
     for _ in range(1, frames):
@@ -221,7 +223,7 @@ def fitted(body, frames, steps):
     )  # fmt: skip
     problem = Problem(scene, Still(body, frames), IdentifyConfig(samples_per_frame=2), CONFIG)
     members = [(effect_named(e.name), torch.tensor(list(e.values.values()))) for e in body.effects]
-    throw = Motion(*(torch.tensor(v, dtype=torch.float32) for v in (body.velocity, body.omega, 0.0)))
+    throw = InitialState(*(torch.tensor(v, dtype=torch.float32) for v in (body.velocity, body.omega, 0.0)))
     effects = ActiveEffects(tuple(members), problem.setting()) if members else None
     with torch.no_grad():
         moved = problem.run(body.law, throw, body.contact, frames - 1, steps, effects)

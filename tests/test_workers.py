@@ -18,17 +18,17 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.families import FAMILIES
-from masiv.identify.problem import Motion, Problem
 from masiv.identify.start import _effort, choose_start
+from masiv.models.families import FAMILIES
+from masiv.models.free_body import Model, Simulation, parameters
+from masiv.models.prepare import video_observation
+from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
+from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import DONE, baselines, derived
 from masiv.refine.config import RefineConfig
-from masiv.refine.model import Model, Simulation, parameters
-from masiv.refine.observed import SampledMotion
-from masiv.refine.prepare import experiment_of
-from masiv.refine.tasks import ranked, side_by_side
-from masiv.workers import Failed, Workers, demanded, processes_wanted
+from masiv.refine.tasks import map_tasks, ranked
+from masiv.workers import TaskError, Workers, processes_wanted, unwrap
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -82,7 +82,7 @@ def test_a_tensor_is_copied_to_a_process_and_its_memory_stays_where_it_is(two):
     """A simulation beside may be reading it."""
     given = torch.zeros(3)
     place = given.data_ptr()
-    results = [*two.map(raised_by_one, [(given,), (given,)]), two.beside(raised_by_one, (given,))()]
+    results = [*two.map(raised_by_one, [(given,), (given,)]), two.submit(raised_by_one, (given,))()]
     assert [r.tolist() for r in results] == [[1.0] * 3] * 3
     assert given.tolist() == [0.0] * 3
     assert given.data_ptr() == place
@@ -95,13 +95,13 @@ def test_results_come_in_order_and_a_failure_is_one_of_them(two):
     assert [f[0] for f in found[::2]] == [0, 1, 2, 3, 4]
     assert [f.reason for f in found[1::2]] == [f"{k} is odd" for k in (1, 3, 5, 7, 9)]
     assert os.getpid() not in {f[1] for f in found[::2]}
-    assert all(isinstance(f, Failed) for f in Workers(1).map(halved, [(1,), (3,)]))
+    assert all(isinstance(f, TaskError) for f in Workers(1).map(halved, [(1,), (3,)]))
 
 
 def test_bad_input_stays_bad_input(two):
     for found in two.map(blamed, [(), ()]):
         with pytest.raises(InputError, match="no such effect"):
-            demanded(found)
+            unwrap(found)
 
 
 def test_each_process_runs_on_one_thread_and_this_one_as_before(two):
@@ -118,9 +118,9 @@ def test_a_process_that_dies_is_told_of():
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_task_beside_this_process(processes):
     with Workers(processes) as workers:
-        here, failing = workers.beside(os.getpid, ()), workers.beside(blamed, ())
+        here, failing = workers.submit(os.getpid, ()), workers.submit(blamed, ())
         assert (here() == os.getpid()) == (processes == 1)
-        assert isinstance(failing(), Failed)
+        assert isinstance(failing(), TaskError)
 
 
 @pytest.mark.parametrize("processes", [1, 2])
@@ -143,7 +143,7 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
     motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
     problem = Problem(scene(), motion, config, SimulatorConfig(), chosen=np.arange(0, 512, 4))
-    throw = Motion.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
+    throw = InitialState.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
     listening = Listening()
     alone, beside = (choose_start(problem, throw, quiet, workers) for workers in (listening, two))
     assert len(alone) == 2
@@ -168,8 +168,8 @@ def small_simulation():
     first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
     config = RefineConfig(particles=200, samples_per_frame=1, laws=["neo_hookean"])
     contact = IdentifyConfig(contact="sticky")
-    experiment, *_ = experiment_of("run", scene(), first, motion, contact, SimulatorConfig(), config)
-    return Simulation([experiment]), config
+    observation, *_ = video_observation("run", scene(), first, motion, contact, SimulatorConfig(), config)
+    return Simulation([observation]), config
 
 
 def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
@@ -191,7 +191,7 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
     simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
-    values = {p.name: p.start for p in parameters(model, simulation.experiments)}
+    values = {p.name: p.start for p in parameters(model, simulation.observations)}
     values |= {f"velocity_{a}@run": v for a, v in zip("xyz", VELOCITY, strict=True)}
     values |= {f"omega_{a}@run": v for a, v in zip("xyz", OMEGA, strict=True)}
     simulation.settle(model, values)
@@ -199,8 +199,8 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     found = []
     for workers in (Workers(1), two):
         before = simulation.rollouts
-        (base,) = side_by_side(workers, simulation, derived, [(model, values, 0)])
-        ranking = ranked(workers, simulation, base, soft=1.0, names=names, progress=quiet)
+        (base,) = map_tasks(workers, simulation, derived, [(model, values, 0)])
+        ranking = ranked(workers, simulation, base, robust_scale=1.0, names=names, progress=quiet)
         found.append((base, ranking, simulation.rollouts - before))
     (base, ranking, count), (other_base, other, other_count) = found
     assert count == other_count == len(base.parameters) + 2 + len(names)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.silhouette import silhouettes
+from masiv.hull.silhouette import silhouettes
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
 

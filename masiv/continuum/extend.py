@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from masiv.checkpoint import Checkpoint
-from masiv.continuum.carve import visual_hull
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.fill import FilledVolume, fill_volume
 from masiv.continuum.finetune import Known, fine_tune
 from masiv.continuum.trajectory import Trajectory, carry
 from masiv.errors import InputError, MasivError
+from masiv.hull.carve import visual_hull
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import ndimage
 
-from masiv.continuum.carve import visual_hull
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.settle import settled_hull
-from masiv.continuum.silhouette import sample_bilinear, silhouettes
 from masiv.errors import MasivError
+from masiv.hull.carve import visual_hull
+from masiv.hull.settle import settled_hull
+from masiv.hull.silhouette import sample_bilinear, silhouettes
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 

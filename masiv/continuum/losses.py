@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from masiv.continuum.silhouette import silhouettes
+from masiv.hull.silhouette import silhouettes
 from masiv.scene.scene import Ground, Scene
 
 _LARGEST_SIDE = 256

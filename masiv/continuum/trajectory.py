@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from masiv.checkpoint import Checkpoint
-from masiv.continuum.carve import visual_hull
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.consistency import consistent_particles
 from masiv.continuum.fill import FilledVolume, density_field, even_points, fill_volume
 from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
+from masiv.hull.carve import visual_hull
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 

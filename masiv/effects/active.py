@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from masiv.effects.effect import Effect, Setting
+from masiv.effects.effect import Effect, EffectContext
 from masiv.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ class ActiveEffects:
     """Effects with the values (P,) of their parameters. Raises InputError for two that both replace the contact."""
 
     members: tuple[tuple[Effect, torch.Tensor], ...]
-    setting: Setting
+    setting: EffectContext
 
     def __post_init__(self) -> None:
         on_ground = [effect.name for effect, _ in self.members if effect.on_grid == "ground"]

@@ -26,7 +26,7 @@ class EffectParameter:
 
 
 @dataclass(frozen=True)
-class Setting:
+class EffectContext:
     """What an effect may know of the scene, simulation frame (y up, ground at y = 0), SI units: gravity (3,), positions
     ``rest`` (N, 3) and mass of the particles at frame 0, size of the body, how long it is watched [s], the time between
     two frames [s], and ``path`` (T, M, 3), where some of its points were seen (None: not known)."""
@@ -41,7 +41,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Outline:
+class DragBody:
     """A body as the medium that it moves through sees it: diameter [m], mass [kg]; density [kg/m^3] and viscosity
     [Pa s] of the medium."""
 
@@ -64,34 +64,34 @@ class Effect(ABC):
     strengths: ClassVar[int] = 1
     on_grid: ClassVar[str | None] = None
     """``nodes``: ``node_velocity`` acts everywhere, before contact; ``ground``: it is the contact with the ground."""
-    kinked: ClassVar[bool] = False
+    nonsmooth: ClassVar[bool] = False
     """Whether it sets in at some strength, or all at once, so that a derivative at none may say nothing of it."""
     on_stress: ClassVar[bool] = False
     cause: ClassVar[bool] = True
     """False for a stop-gap, which no search may name."""
-    on_held: ClassVar[bool] = False
+    needs_clamp: ClassVar[bool] = False
     """Whether it acts on a body that is held somewhere: on a free one it is nothing but another effect."""
 
     inside: ClassVar[bool] = False
     """Whether its place is in the body: it acts on the matter that is there."""
-    stands_for: ClassVar[str | None] = None
+    replaces_parameter: ClassVar[str | None] = None
     """What of every throw is fitted for want of this effect, and no longer beside it."""
 
-    of_body: ClassVar[bool] = False
+    per_body: ClassVar[bool] = False
     """Whether the strength depends on the body (a drag), so that bodies may differ; else it is that of the
     surroundings, one for all that move in them."""
     shared: ClassVar[tuple[EffectParameter, ...] | None] = None
     """The strength as bodies of different size and mass may share it, see ``of``; None: as it is."""
 
-    def of(self, theta: torch.Tensor, body: Outline) -> torch.Tensor:
+    def of(self, theta: torch.Tensor, body: DragBody) -> torch.Tensor:
         """Values of ``shared`` (P,) -> the parameters of ``body`` (P,)."""
         return theta
 
-    def contradiction(self, theta: torch.Tensor, body: Outline) -> str | None:
+    def violates_bounds(self, theta: torch.Tensor, body: DragBody) -> str | None:
         """Why values of ``shared`` (P,) cannot be, given what is known of the body and the medium."""
         return None
 
-    def unseen(self, theta: torch.Tensor, watched: float, places: torch.Tensor) -> str | None:
+    def identifiability_issue(self, theta: torch.Tensor, watched: float, places: torch.Tensor) -> str | None:
         """Why parameters (P,) do not deserve the effect's name after ``watched`` seconds of motion in which points of
         the body came through ``places`` (M, 3) [m], or None."""
         return None
@@ -106,15 +106,15 @@ class Effect(ABC):
         ``on_stress``."""
         raise TypeError(f"{self.name} does not act on the stress")
 
-    def coefficients(self, theta: torch.Tensor, setting: Setting) -> torch.Tensor:
+    def coefficients(self, theta: torch.Tensor, setting: EffectContext) -> torch.Tensor:
         """Parameters (P,) -> c, shape (K,) for an effect on the grid, (N, K) for one on the stress; differentiable."""
         return theta.expand(len(setting.rest), -1) if self.on_stress else theta
 
-    def mass_factor(self, theta: torch.Tensor, setting: Setting) -> torch.Tensor | None:
+    def mass_factor(self, theta: torch.Tensor, setting: EffectContext) -> torch.Tensor | None:
         """Factor (N,) of the particles' masses, or None where the effect leaves masses alone."""
         return None
 
-    def force(self, theta: torch.Tensor, setting: Setting) -> torch.Tensor | None:
+    def force(self, theta: torch.Tensor, setting: EffectContext) -> torch.Tensor | None:
         """Force (N, 3) [N] on each particle, the same at all times, or None."""
         return None
 
@@ -126,6 +126,6 @@ class Effect(ABC):
         """How much later () [s] than its time stamp a frame was taken, or None."""
         return None
 
-    def guesses(self, setting: Setting) -> list[tuple[float, ...]]:
+    def guesses(self, setting: EffectContext) -> list[tuple[float, ...]]:
         """Values of the parameters after the strengths to try in the score test, each a tuple."""
         return [tuple(p.start for p in self.parameters[self.strengths :])]

@@ -29,7 +29,7 @@ class GroundFriction(Effect):
     looks_like = "after it lands the body slides on, where it should have stuck"
     parameters = (EffectParameter("slipperiness", "1", 0.0, 100.0, 0.5),)
     on_grid = "ground"
-    kinked = True
+    nonsmooth = True
 
     def node_velocity(self):
         return _slid

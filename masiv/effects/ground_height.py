@@ -12,7 +12,7 @@ class GroundHeight(Effect):
     name = "ground_height"
     looks_like = "contact begins early or late, and the body rests too high or too low"
     parameters = (EffectParameter("height", "m", -0.3, 0.3, 0.001),)
-    stands_for = "ground_offset"
+    replaces_parameter = "ground_offset"
 
     def ground_shift(self, theta):
         return theta[0]

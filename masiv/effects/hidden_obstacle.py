@@ -5,8 +5,8 @@ import taichi as ti
 import torch
 
 from masiv.effects._place import PLACE, as_guesses, spread
-from masiv.effects.effect import Effect, EffectParameter, Setting
-from masiv.rigid import struck
+from masiv.effects.effect import Effect, EffectContext, EffectParameter
+from masiv.rigid import impact_point
 
 _GUESSES = 11
 
@@ -53,10 +53,10 @@ class HiddenObstacle(Effect):
         return as_guesses(torch.cat([*_struck(setting, self.parameters[0].step), *places])) if places else []
 
 
-def _struck(setting: Setting, least_height: float) -> list[torch.Tensor]:
+def _struck(setting: EffectContext, least_height: float) -> list[torch.Tensor]:
     """The place (1, 3) [m] where the body is first turned aside, if that is higher than ``least_height`` [m]."""
     if setting.path is None:
         return []
     path = setting.path.double().numpy()
-    place = struck(path, np.arange(len(path)) * setting.frame_time, setting.gravity.double().numpy())
+    place = impact_point(path, np.arange(len(path)) * setting.frame_time, setting.gravity.double().numpy())
     return [torch.as_tensor(place[None]).to(setting.rest)] if place is not None and place[1] > least_height else []

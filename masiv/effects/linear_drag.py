@@ -25,7 +25,7 @@ class LinearDrag(Effect):
         """k = 3 pi mu d / m of a sphere."""
         return theta * (3 * math.pi * body.diameter / body.mass)
 
-    def contradiction(self, theta, body):
+    def violates_bounds(self, theta, body):
         """No shape has more than a few times the drag of a sphere."""
         if float(theta[0]) <= 10 * body.medium_viscosity:
             return None

@@ -37,7 +37,7 @@ class PeriodicForce(Effect):
     def coefficients(self, theta, setting):
         return torch.cat([theta[:6], 2 * math.pi * theta[6:]])
 
-    def unseen(self, theta, watched, places):
+    def identifiability_issue(self, theta, watched, places):
         """What has not come round once is a force that changes, and nothing says that it is periodic."""
         frequency = float(theta[6])
         if frequency * watched >= 1:

@@ -17,7 +17,7 @@ class PointForce(Effect):
     looks_like = "a held body rests, or swings about, another place, as fast as it would without"
     parameters = (*(EffectParameter(f"force_{axis}", "N", -1e4, 1e4, 1.0) for axis in "xyz"), *PLACE)
     strengths = 3
-    on_held = True
+    needs_clamp = True
     inside = True
 
     def force(self, theta, setting):

@@ -20,7 +20,7 @@ class QuadraticDrag(Effect):
     looks_like = "fast parts slow down most: a throw loses speed early, a slow spin hardly changes"
     parameters = (EffectParameter("coefficient", "1/m", 0.0, 20.0, 0.02),)
     on_grid = "nodes"
-    of_body = True
+    per_body = True
     shared = (EffectParameter("drag_coefficient", "1", 0.0, 3.0, 0.05),)
 
     def of(self, theta, body):

@@ -21,7 +21,7 @@ class Restitution(Effect):
     looks_like = "the body bounces higher than it should, or leaves a ground that should have kept it"
     parameters = (EffectParameter("coefficient", "1", 0.0, 1.0, 0.02),)
     on_grid = "ground"
-    kinked = True
+    nonsmooth = True
 
     def node_velocity(self):
         return _thrown_back

@@ -29,7 +29,7 @@ class Swirl(Effect):
     def node_velocity(self):
         return _swirled
 
-    def unseen(self, theta, watched, places):
+    def identifiability_issue(self, theta, watched, places):
         """About an axis that is far from where the body was, it pushes all of it the same way."""
         arms = places[:, ::2].double() - theta[1:].double()
         middle = arms.mean(0)

@@ -17,16 +17,16 @@ from masiv.identify.classical_fit import (
     keep,
     ranked,
 )
-from masiv.identify.families import FAMILIES
 from masiv.identify.fit import fit as fit_weights
 from masiv.identify.found import Found, history_rows
 from masiv.identify.judged import nearest_first, picture_errors_of
 from masiv.identify.polish import wanted
-from masiv.identify.problem import Motion, Problem
 from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
+from masiv.models.families import FAMILIES
+from masiv.models.problem import InitialState, Problem
 from masiv.progress import Progress, silent
-from masiv.workers import Failed, Workers, processes_wanted
+from masiv.workers import TaskError, Workers, processes_wanted
 
 SHORT = 1 / 3
 FINALISTS = 2
@@ -35,8 +35,8 @@ BY_PICTURES = "nearest to the pictures, the simpler one where two are about as n
 
 def identify_classical(
     problem: Problem,
-    few: Problem,
-    motion: Motion,
+    coarse: Problem,
+    motion: InitialState,
     first_frames: int,
     seed: int,
     checkpoint: Checkpoint,
@@ -49,12 +49,12 @@ def identify_classical(
     failures: dict[str, str] = {}
     if law == "auto":
         with Workers(processes_wanted(config.processes), "identify.processes") as workers:
-            fits, failures = _shortlisted(few, motion, first_frames, pictures, checkpoint, progress, workers)
+            fits, failures = _shortlisted(coarse, motion, first_frames, pictures, checkpoint, progress, workers)
     else:
-        fits = [fit_family(law, few, motion, first_frames, checkpoint, progress, pictures=pictures)]
-    seen = picture_errors_of(few, fits) if law == "auto" else {}
+        fits = [fit_family(law, coarse, motion, first_frames, checkpoint, progress, pictures=pictures)]
+    seen = picture_errors_of(coarse, fits) if law == "auto" else {}
     order = nearest_first(fits, seen)
-    chosen = fit_all_particles(order[0], few, problem, checkpoint, progress, pictures=pictures)
+    chosen = fit_all_particles(order[0], coarse, problem, checkpoint, progress, pictures=pictures)
     errors = {name: _known(chosen.stderr[name]) for name in chosen.values if name not in chosen.law.values}
     report: dict[str, Any] = {
         "law": chosen.kind,
@@ -95,7 +95,7 @@ class Beside(Checkpoint):
 
 
 def _shortlisted(
-    few: Problem, motion: Motion, first_frames: int, pictures: bool,
+    coarse: Problem, motion: InitialState, first_frames: int, pictures: bool,
     checkpoint: Checkpoint, progress: Progress, workers: Workers,
 ) -> tuple[list[FamilyFit], dict[str, str]]:  # fmt: skip
     """Short fits of every family, then in full the best ``FINALISTS`` by their paths and the best by the pictures
@@ -105,10 +105,10 @@ def _shortlisted(
     failures: dict[str, str] = {}
     heard = progress if workers.processes == 1 else silent
 
-    def done(kinds: Sequence[str], found: Iterable[FamilyFit | Failed], label: str) -> None:
+    def done(kinds: Sequence[str], found: Iterable[FamilyFit | TaskError], label: str) -> None:
         progress(label, 0, len(kinds), ", ".join(kinds))
         for k, (kind, fit) in enumerate(zip(kinds, found, strict=True)):
-            if isinstance(fit, Failed):
+            if isinstance(fit, TaskError):
                 failures[kind] = fit.reason
                 note = f"{kind}: {fit.reason}"
             else:
@@ -118,31 +118,31 @@ def _shortlisted(
             progress(label, k + 1, len(kinds), note)
 
     missing = [kind for kind in FAMILIES if kind not in fits]
-    tasks = [(kind, few, motion, first_frames, pictures, heard) for kind in missing]
+    tasks = [(kind, coarse, motion, first_frames, pictures, heard) for kind in missing]
     done(missing, workers.map(_short_fit, tasks), "identify: classical laws, in short")
     if not fits:
         raise MasivError(f"identify: no classical law explains the motion ({next(iter(failures.values()))})")
     if "finalists" not in saved:  # a fit that went on is no short one any more
         short = list(fits.values())
-        best = [*ranked(short)[:FINALISTS], nearest_first(short, picture_errors_of(few, short))[0]]
+        best = [*ranked(short)[:FINALISTS], nearest_first(short, picture_errors_of(coarse, short))[0]]
         saved = {**(checkpoint.load() or {}), "finalists": list(dict.fromkeys(f.kind for f in best))}
         checkpoint.save(saved)
     kinds = saved["finalists"]
-    tasks = [(fits[kind], few, pictures, heard) for kind in kinds]
+    tasks = [(fits[kind], coarse, pictures, heard) for kind in kinds]
     done(kinds, workers.map(_further_fit, tasks), "identify: classical laws, the best")
     return list(fits.values()), failures
 
 
 def _short_fit(
-    kind: str, few: Problem, motion: Motion, first_frames: int, pictures: bool, progress: Progress
+    kind: str, coarse: Problem, motion: InitialState, first_frames: int, pictures: bool, progress: Progress
 ) -> FamilyFit:
     return fit_family(
-        kind, few, motion, first_frames, Checkpoint(None), progress, share=SHORT, pictures=pictures
+        kind, coarse, motion, first_frames, Checkpoint(None), progress, share=SHORT, pictures=pictures
     )  # fmt: skip
 
 
-def _further_fit(found: FamilyFit, few: Problem, pictures: bool, progress: Progress) -> FamilyFit:
-    return fit_further(found, few, progress, pictures=pictures)
+def _further_fit(found: FamilyFit, coarse: Problem, pictures: bool, progress: Progress) -> FamilyFit:
+    return fit_further(found, coarse, progress, pictures=pictures)
 
 
 def family_rows(order: list[FamilyFit], pictures: Mapping[str, float]) -> list[dict[str, Any]]:

@@ -15,11 +15,10 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
-from masiv.identify.correlation import effective_samples
-from masiv.identify.families import FAMILIES, Family, Rollouts, law_of, mean_distance, motion_of, motion_parameters
 from masiv.identify.misfit import Misfit
 from masiv.identify.objective import objective
-from masiv.identify.parametric import (
+from masiv.inference.correlation import effective_samples
+from masiv.inference.least_squares import (
     FIRST_STEP,
     Estimate,
     Parameter,
@@ -28,8 +27,17 @@ from masiv.identify.parametric import (
     robust_cost,
     robust_weight,
 )
-from masiv.identify.problem import Motion, Problem
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.families import (
+    FAMILIES,
+    Family,
+    Rollouts,
+    initial_state_from,
+    initial_state_parameters,
+    law_of,
+    mean_distance,
+)
+from masiv.models.problem import InitialState, Problem
 from masiv.progress import Progress
 
 RECONSIDERED = 3
@@ -66,22 +74,22 @@ class FamilyFit:
         return law
 
     @property
-    def motion(self) -> Motion:
-        return motion_of(self.values)
+    def motion(self) -> InitialState:
+        return initial_state_from(self.values)
 
     def state(self) -> dict[str, Any]:
         """Plain values, as a checkpoint keeps them."""
         return asdict(self)
 
 
-def search(problem: Problem, family: Family, motion: Motion, progress: Progress, *, pictures: bool) -> FamilyFit:
+def search(problem: Problem, family: Family, motion: InitialState, progress: Progress, *, pictures: bool) -> FamilyFit:
     """The best of ``Family.candidates``, each with the contact that the configuration names, or the best ones with
     each, by their paths, or, as the starts of a neural law, by these and the pictures. Raises MasivError where all
     diverge."""
     contacts = ["sticky", "release"] if problem.config.contact == "auto" else [problem.config.contact]
     if problem.scene.ground is None:
         contacts = ["none"]
-    throw = {p.name: p.start for p in motion_parameters(problem, motion)}
+    throw = {p.name: p.start for p in initial_state_parameters(problem, motion)}
     candidates = family.candidates()
     extra = (len(contacts) - 1) * min(RECONSIDERED, len(candidates))
     found: list[tuple[float, int, str, float]] = []
@@ -114,8 +122,8 @@ def search(problem: Problem, family: Family, motion: Motion, progress: Progress,
 
 def fit_family(
     kind: str,
-    few: Problem,
-    motion: Motion,
+    coarse: Problem,
+    motion: InitialState,
     first_frames: int,
     checkpoint: Checkpoint,
     progress: Progress,
@@ -128,28 +136,28 @@ def fit_family(
     share: of the rollouts that the configuration allows a stage. pictures: fit these, too, see ``Misfit``. Raises
     MasivError where every start diverges.
     """
-    family = FAMILIES[kind].scaled(few.scene.density)
+    family = FAMILIES[kind].scaled(coarse.scene.density)
     saved = (checkpoint.load() or {}).get(kind)
     if saved is None:
-        found = search(few, family, motion, progress, pictures=pictures)
+        found = search(coarse, family, motion, progress, pictures=pictures)
         keep(checkpoint, found)
     else:
         found = FamilyFit(**saved)
-    middle = min(few.frames, max(first_frames, (few.frames + 1) // 2))
-    budget = max(2, round(share * few.config.family_rollouts))
-    for stage, frames in ((1, middle), (2, few.frames)):
+    middle = min(coarse.frames, max(first_frames, (coarse.frames + 1) // 2))
+    budget = max(2, round(share * coarse.config.family_rollouts))
+    for stage, frames in ((1, middle), (2, coarse.frames)):
         if found.stage < stage:
-            found = _stage(few, family, found, frames, stage, budget, progress, pictures)
+            found = _stage(coarse, family, found, frames, stage, budget, progress, pictures)
             keep(checkpoint, found)
     return found
 
 
-def fit_further(found: FamilyFit, few: Problem, progress: Progress, *, pictures: bool = False) -> FamilyFit:
+def fit_further(found: FamilyFit, coarse: Problem, progress: Progress, *, pictures: bool = False) -> FamilyFit:
     """``found``, whose fit was shortened, fitted to all frames once more from where it ended."""
     if found.stage >= FURTHER:
         return found
-    family = FAMILIES[found.kind].scaled(few.scene.density)
-    return _stage(few, family, found, few.frames, FURTHER, few.config.family_rollouts, progress, pictures)
+    family = FAMILIES[found.kind].scaled(coarse.scene.density)
+    return _stage(coarse, family, found, coarse.frames, FURTHER, coarse.config.family_rollouts, progress, pictures)
 
 
 def keep(checkpoint: Checkpoint, found: FamilyFit, name: str | None = None) -> None:
@@ -197,7 +205,7 @@ def _of_paths(estimate: Estimate, misfit: Misfit) -> Estimate:
 
 
 def fit_all_particles(
-    found: FamilyFit, few: Problem, problem: Problem, checkpoint: Checkpoint, progress: Progress,
+    found: FamilyFit, coarse: Problem, problem: Problem, checkpoint: Checkpoint, progress: Progress,
     *, pictures: bool = False,
 ) -> FamilyFit:  # fmt: skip
     """Chord steps: the Jacobian of few particles on the residual of the same particles in rollouts of all of them.
@@ -210,13 +218,13 @@ def fit_all_particles(
         return FamilyFit(**saved)
     label = f"identify: {found.kind} fit, {ALL}"
     total = CHORD_STEPS + 2
-    family = FAMILIES[found.kind].scaled(few.scene.density)
-    parameters = _parameters(few, family, found)
+    family = FAMILIES[found.kind].scaled(coarse.scene.density)
+    parameters = _parameters(coarse, family, found)
     progress(label, 0, total)
-    on_few = Misfit(few, family, found.contact, few.frames, pictures=pictures)
+    on_few = Misfit(coarse, family, found.contact, coarse.frames, pictures=pictures)
     coarse = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
     progress(label, 1, total)
-    misfit = Misfit(problem, family, found.contact, problem.frames, pictures=pictures, chosen=few.chosen)
+    misfit = Misfit(problem, family, found.contact, problem.frames, pictures=pictures, chosen=coarse.chosen)
     softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(coarse.residual))), 1e-12)
     values, jacobian, scale = found.values, coarse.jacobian, 1.0
     best, residual = misfit(values)
@@ -240,7 +248,7 @@ def fit_all_particles(
     weight = robust_weight(residual, softness)
     spread = covariance(jacobian * weight[:, None], residual * weight)
     estimate = Estimate(values, spread, jacobian, residual, coarse.evaluations + CHORD_STEPS + 1, tuple(parameters))
-    found = _updated(few, found, _of_paths(estimate, misfit), 4)
+    found = _updated(coarse, found, _of_paths(estimate, misfit), 4)
     found.error_m = mean_distance(best)
     keep(checkpoint, found, f"{found.kind}, {ALL}")
     progress(label, total, total, f"{1e3 * found.error_m:.1f} mm")
@@ -269,7 +277,7 @@ def ranked(fits: list[FamilyFit]) -> list[FamilyFit]:
 
 
 def _parameters(problem: Problem, family: Family, found: FamilyFit) -> list[Parameter]:
-    both = [*family.parameters, *motion_parameters(problem, found.motion)]
+    both = [*family.parameters, *initial_state_parameters(problem, found.motion)]
     return [replace(p, start=float(np.clip(found.values[p.name], p.lower, p.upper))) for p in both]
 
 

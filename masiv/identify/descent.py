@@ -10,9 +10,9 @@ import torch
 
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.problem import Motion
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
+from masiv.models.problem import InitialState
 
 FAILURES_ALLOWED = 8
 RECOVERY = 1.4
@@ -25,7 +25,7 @@ class Descent:
     """``law`` and ``motions`` are moved in place. reach: frames that a rollout may have, ``longest`` at most."""
 
     def __init__(
-        self, law: NeuralLaw | AdapterLaw, motions: Sequence[Motion], config: IdentifyConfig, longest: int
+        self, law: NeuralLaw | AdapterLaw, motions: Sequence[InitialState], config: IdentifyConfig, longest: int
     ) -> None:
         if isinstance(law, NeuralLaw):
             scales, weights = law.scales(), [*law.elastic.parameters(), *law.plastic.parameters()]

@@ -18,10 +18,10 @@ from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.descent import Descent
 from masiv.identify.objective import objective
 from masiv.identify.pictures import compared, picture_errors, picture_objective
-from masiv.identify.problem import Motion, Problem
 from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
+from masiv.models.problem import InitialState, Problem
 from masiv.progress import Progress
 
 
@@ -31,7 +31,7 @@ class Fit:
     objective: what was made small, there; history: (iteration, frames, trajectory error [m], silhouette error)."""
 
     law: NeuralLaw | AdapterLaw
-    motions: tuple[Motion, ...]
+    motions: tuple[InitialState, ...]
     error_m: float = math.inf
     objective: float = math.inf
     history: list[tuple[int, int, float, float]] = field(default_factory=list)
@@ -67,7 +67,7 @@ def fit(
     """
     config = throws[0].problem.config
     start, law = prior or law, copy.deepcopy(law)
-    motions = [Motion(*(t.detach().clone().requires_grad_() for t in throw.motion.tensors())) for throw in throws]
+    motions = [InitialState(*(t.detach().clone().requires_grad_() for t in throw.motion.tensors())) for throw in throws]
     descent = Descent(law, motions, config, max(throw.problem.frames for throw in throws))
     best = Fit(copy.deepcopy(law), _copied(motions))
     first = 0
@@ -108,7 +108,7 @@ def fit(
 def _descend(
     problem: Problem,
     law: NeuralLaw | AdapterLaw,
-    motion: Motion,
+    motion: InitialState,
     contact: str,
     frames: int,
     departure: torch.Tensor,
@@ -129,18 +129,20 @@ def _descend(
 
 
 @torch.no_grad()
-def _whole(throw: Throw, motion: Motion, law: NeuralLaw | AdapterLaw, contact: str) -> _Pass:
+def _whole(throw: Throw, motion: InitialState, law: NeuralLaw | AdapterLaw, contact: str) -> _Pass:
     """A rollout over all frames."""
     problem = throw.problem
     positions = problem.run(law, motion, contact, problem.frames)
     return _Pass(problem.frames, float(problem.error(positions)), 0.0, objective(problem, positions))
 
 
-def _copied(motions: Sequence[Motion]) -> tuple[Motion, ...]:
-    return tuple(Motion(*(t.detach().clone() for t in motion.tensors())) for motion in motions)
+def _copied(motions: Sequence[InitialState]) -> tuple[InitialState, ...]:
+    return tuple(InitialState(*(t.detach().clone() for t in motion.tensors())) for motion in motions)
 
 
-def _keep_better(best: Fit, passed: Sequence[_Pass], law: NeuralLaw | AdapterLaw, motions: Sequence[Motion]) -> None:
+def _keep_better(
+    best: Fit, passed: Sequence[_Pass], law: NeuralLaw | AdapterLaw, motions: Sequence[InitialState]
+) -> None:
     """Put law and motions into ``best`` where their rollouts, all over all frames, are nearer to what was observed."""
     objectives = [p.objective for p in passed if p.objective is not None]
     if len(objectives) == len(passed) and mean(objectives) < best.objective:
@@ -188,7 +190,7 @@ def fit_from(state: dict, law: NeuralLaw | AdapterLaw) -> Fit:
         )
     law.load_state_dict(state["law"])
     rows = [tuple(row) for row in state["history"]]
-    motions = tuple(Motion(*tensors) for tensors in state["motions"])
+    motions = tuple(InitialState(*tensors) for tensors in state["motions"])
     return Fit(law, motions, state["error_m"], state["objective"], rows)
 
 

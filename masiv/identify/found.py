@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from masiv.identify.fit import Fit
-from masiv.identify.problem import Motion
 from masiv.materials.law import Law
+from masiv.models.problem import InitialState
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Found:
     """
 
     law: Law
-    motion: Motion
+    motion: InitialState
     contact: str
     error_m: float
     report: dict[str, Any] = field(default_factory=dict)

@@ -11,12 +11,12 @@ from masiv.checkpoint import Checkpoint
 from masiv.identify.fit import Fit, fit, fit_from, fit_state
 from masiv.identify.found import Found, history_rows
 from masiv.identify.polish import polish, wanted
-from masiv.identify.problem import Problem
 from masiv.identify.start import Start, best_first, choose_start
 from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
+from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
-from masiv.workers import Failed, Workers, attempt, demanded, processes_wanted
+from masiv.workers import TaskError, Workers, processes_wanted, run_task, unwrap
 
 RIVAL = 1.3
 """The second start is fitted, too, where its error is at most this factor of the first's. Starts are simulated with few
@@ -34,7 +34,7 @@ class Reached:
 
 
 def learn(
-    throws: Sequence[Throw], few: Callable[[], Problem], seed: int, checkpoint: Checkpoint, progress: Progress
+    throws: Sequence[Throw], coarse: Callable[[], Problem], seed: int, checkpoint: Checkpoint, progress: Progress
 ) -> Found:
     """The neural law that explains all ``throws`` best, and the motion of the first. few: the first with few particles,
     for the search of a start. Raises MasivError."""
@@ -45,16 +45,18 @@ def learn(
             starts = [_start_from(state) for state in saved["starts"]]
         else:
             workers.begin()
-            starts = _worth_fitting(choose_start(few(), throws[0].motion, progress, workers))
+            starts = _worth_fitting(choose_start(coarse(), throws[0].motion, progress, workers))
         keeper = _With(checkpoint, {"starts": [_start_state(start) for start in starts]})
         if "starts" not in saved:
             keeper.save({})
         heard = silent if workers.processes > 1 else (lambda what, *said: progress(f"{what}, a rival", *said))
-        rest = [workers.beside(_reach_apart, (throws, s, seed, heard)) for s in starts[1:]]
-        first = attempt(_reach, (throws, starts[0], seed, keeper, progress))
+        rest = [workers.submit(_reach_apart, (throws, s, seed, heard)) for s in starts[1:]]
+        first = run_task(_reach, (throws, starts[0], seed, keeper, progress))
         ends = [(starts[0], first), *((start, waited()) for start, waited in zip(starts[1:], rest, strict=True))]
-    reached = [_reached_from(start, end) for start, end in ends if not isinstance(end, Failed)]  # it diverges, perhaps
-    kept = _best(reached) if reached else demanded(first)
+    reached = [
+        _reached_from(start, end) for start, end in ends if not isinstance(end, TaskError)
+    ]  # it diverges, perhaps
+    kept = _best(reached) if reached else unwrap(first)
     report: dict[str, Any] = {
         "start": kept.start.material, "start_objective": kept.start.error,
         "geometry_loss": config.geometry_loss, "throws": len(throws), **kept.report,

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import torch
 
-from masiv.identify.families import Family, Rollouts
 from masiv.identify.pictures import VIEWS, beside_pictures, some_of_each
-from masiv.identify.problem import Problem
+from masiv.models.families import Family, Rollouts
+from masiv.models.problem import Problem
 
 
 class Misfit:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from masiv.identify.pictures import Window, drawn, to_world, window
-from masiv.identify.problem import Problem
+from masiv.models.problem import Problem
 
 SWEEPS = 12
 BRUSH = 0.5

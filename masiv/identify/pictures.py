@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from masiv.identify.problem import Motion, Problem
 from masiv.materials.law import Law
+from masiv.models.problem import InitialState, Problem
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 from masiv.splat.rasteriser import Rendering, render
@@ -118,7 +118,7 @@ def _beside(
 
 
 @torch.no_grad()
-def shown(problem: Problem, law: Law, motion: Motion, contact: str) -> tuple[torch.Tensor, torch.Tensor]:
+def shown(problem: Problem, law: Law, motion: InitialState, contact: str) -> tuple[torch.Tensor, torch.Tensor]:
     """``picture_errors`` of a rollout in ``VIEWS`` pictures of each frame, by which fits are compared."""
     positions = problem.run(law, motion, contact, problem.frames)
     return picture_errors(problem, positions, some_of_each(problem, problem.frames, VIEWS))

@@ -13,13 +13,13 @@ from masiv.checkpoint import Checkpoint
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.baseline import identify_classical
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.few import at_random
 from masiv.identify.learn import learn
-from masiv.identify.problem import Motion, Problem
 from masiv.identify.throw import Throw, throw_of
+from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
+from masiv.subsample import random_subset
 from masiv.twin import Twin
 
 
@@ -59,15 +59,15 @@ def _identify(
     progress: Progress,
 ) -> Twin:
     scene, trajectory = seen[0]
-    throws, launches = zip(*(throw_of(*one, config, simulator) for one in seen), strict=True)
-    first, launch, axes = throws[0], launches[0], throws[0].problem.axes
-    chosen = at_random(trajectory.positions.shape[1], config.search_particles, seed)
-    few = functools.partial(Problem, scene, trajectory, config, simulator, chosen=chosen)
+    throws, initial_motions = zip(*(throw_of(*one, config, simulator) for one in seen), strict=True)
+    first, initial_motion, axes = throws[0], initial_motions[0], throws[0].problem.axes
+    chosen = random_subset(trajectory.positions.shape[1], config.search_particles, seed)
+    coarse = functools.partial(Problem, scene, trajectory, config, simulator, chosen=chosen)
     if config.law == "neural":
-        found = learn(throws, few, seed, checkpoint, progress)
+        found = learn(throws, coarse, seed, checkpoint, progress)
     else:
         found = identify_classical(
-            first.problem, few(), first.motion, first.first_frames, seed, checkpoint, progress
+            first.problem, coarse(), first.motion, first.first_frames, seed, checkpoint, progress
         )  # fmt: skip
     return Twin(
         positions=np.asarray(trajectory.positions[0], dtype=np.float32),
@@ -86,9 +86,9 @@ def _identify(
         fit={
             **found.report,
             "trajectory_error_mm": 1e3 * found.error_m,
-            "launch_velocity_m_per_s": [float(v) for v in launch.velocity],
-            "launch_omega_rad_per_s": [float(v) for v in launch.omega],
-            "launch_last_frame": launch.last_frame,
+            "launch_velocity_m_per_s": [float(v) for v in initial_motion.velocity],
+            "launch_omega_rad_per_s": [float(v) for v in initial_motion.omega],
+            "launch_last_frame": initial_motion.last_frame,
             "frames": scene.frame_count,
             "history": found.history,
         },
@@ -110,14 +110,14 @@ def relearn(
     Raises MasivError where no law explains ``trajectory``.
     """
     made = functools.partial(Problem, scene, trajectory, config, twin.simulator, known=twin.effects)
-    chosen = at_random(trajectory.positions.shape[1], config.search_particles, seed)
-    problem, few = made(), functools.partial(made, chosen=chosen)
+    chosen = random_subset(trajectory.positions.shape[1], config.search_particles, seed)
+    problem, coarse = made(), functools.partial(made, chosen=chosen)
     axes = problem.axes
     raised = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
-    motion = Motion.of_world(axes, twin.velocity, twin.omega, raised)
+    motion = InitialState.of_world(axes, twin.velocity, twin.omega, raised)
     with runtime.torch_threads(1):
         throw = Throw(problem, motion, (problem.frames + 1) // 2)
-        found = learn([throw], few, seed, checkpoint or Checkpoint(None), progress)
+        found = learn([throw], coarse, seed, checkpoint or Checkpoint(None), progress)
     return replace(
         twin,
         velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),

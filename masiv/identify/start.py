@@ -15,12 +15,12 @@ from scipy.optimize import minimize
 from masiv.errors import InputError, MasivError
 from masiv.identify.objective import objective
 from masiv.identify.pictures import compared
-from masiv.identify.problem import Motion, Problem
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
 from masiv.materials.pretrain import MATERIALS, pretrained_path
+from masiv.models.problem import InitialState, Problem
 from masiv.progress import Progress
-from masiv.workers import Workers, demanded
+from masiv.workers import Workers, unwrap
 
 MODULI = (3e3, 1e4, 3e4, 1e5, 3e5)
 """P-wave moduli tried [Pa at 1000 kg/m^3]: waves of 1.7 to 17 m/s, from what sags at once to what hardly deforms in a
@@ -62,7 +62,9 @@ def with_scales(law: NeuralLaw, modulus: float, logs: Sequence[float] = ()) -> N
     return scaled
 
 
-def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: Workers | None = None) -> list[Start]:
+def choose_start(
+    problem: Problem, motion: InitialState, progress: Progress, workers: Workers | None = None
+) -> list[Start]:
     """Candidates, best first: each material at each of ``MODULI``, then contacts and a simplex search over scales for
     most; the elastic one counts as the better where another is hardly nearer (``TELLS``).
 
@@ -78,7 +80,7 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: 
     moduli = [modulus * density for modulus in MODULI]
     if compared(problem):
         _ = problem.blob_size, problem.paint  # found here once, or each process would find its own
-    found = map(demanded, workers.map(_errors, [(problem, motion, name, contacts[0], moduli) for name in materials]))
+    found = map(unwrap, workers.map(_errors, [(problem, motion, name, contacts[0], moduli) for name in materials]))
     best: dict[str, tuple[float, float]] = {}
     for done, (name, errors) in enumerate(zip(materials, found, strict=True)):
         best[name] = min(zip(errors, moduli, strict=True))
@@ -89,7 +91,7 @@ def choose_start(problem: Problem, motion: Motion, progress: Progress, workers: 
     longest_first = sorted(ranked, key=lambda name: -_effort(name, best[name][1]))
     searched = workers.map(_searched, [(problem, motion, name, contacts, *best[name]) for name in longest_first])
     starts = {}
-    for done, (name, (contact, logs, error)) in enumerate(zip(longest_first, map(demanded, searched), strict=True)):
+    for done, (name, (contact, logs, error)) in enumerate(zip(longest_first, map(unwrap, searched), strict=True)):
         starts[name] = Start(name, contact, with_scales(_law(name), best[name][1], logs), error)
         progress("identify: start", done + 1, len(ranked), f"{name}, {contact}: {said(error)}")
     return best_first([starts[name] for name in ranked])
@@ -105,13 +107,13 @@ def said(error: float) -> str:
     return "diverges" if error >= DIVERGED else f"objective {error:.3f}"
 
 
-def _errors(problem: Problem, motion: Motion, name: str, contact: str, moduli: Sequence[float]) -> list[float]:
+def _errors(problem: Problem, motion: InitialState, name: str, contact: str, moduli: Sequence[float]) -> list[float]:
     """Of several moduli at once: another process reads the pictures for each task anew."""
     return [_error(problem, motion, name, contact, modulus) for modulus in moduli]
 
 
 def _searched(
-    problem: Problem, motion: Motion, name: str, contacts: Sequence[str], error: float, modulus: float
+    problem: Problem, motion: InitialState, name: str, contacts: Sequence[str], error: float, modulus: float
 ) -> tuple[str, tuple[float, ...], float]:
     """The best of ``contacts``, and logarithms of factors of the scales and the error after a simplex search from a
     candidate, whose ``error`` is that of the first contact."""
@@ -150,7 +152,7 @@ def _law(name: str) -> NeuralLaw:
 
 @torch.no_grad()
 def _error(
-    problem: Problem, motion: Motion, name: str, contact: str, modulus: float, logs: tuple[float, ...] = ()
+    problem: Problem, motion: InitialState, name: str, contact: str, modulus: float, logs: tuple[float, ...] = ()
 ) -> float:
     scaled = with_scales(_law(name), modulus, logs)
     if scaled.wave_modulus() > STIFFEST * problem.scene.density / 1000:

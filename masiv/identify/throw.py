@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.launch import Launch, estimate_launch
-from masiv.identify.problem import Motion, Problem
+from masiv.models.initial_motion import InitialMotion, estimate_initial_motion
+from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Scene
 
@@ -18,17 +18,17 @@ class Throw:
     frames the fit begins with."""
 
     problem: Problem
-    motion: Motion
+    motion: InitialState
     first_frames: int
 
 
 def throw_of(
     scene: Scene, trajectory: Trajectory, config: IdentifyConfig, simulator: SimulatorConfig
-) -> tuple[Throw, Launch]:
+) -> tuple[Throw, InitialMotion]:
     """A throw that begins with the motion of its free flight, and with the frames of that and one more."""
     problem = Problem(scene, trajectory, config, simulator)
-    launch = estimate_launch(
+    initial_motion = estimate_initial_motion(
         trajectory.positions, trajectory.times, scene.gravity, scene.ground, clearance=problem.spacing
     )
-    motion = Motion.of_world(problem.axes, launch.velocity, launch.omega)
-    return Throw(problem, motion, min(launch.last_frame + 2, problem.frames)), launch
+    motion = InitialState.of_world(problem.axes, initial_motion.velocity, initial_motion.omega)
+    return Throw(problem, motion, min(initial_motion.last_frame + 2, problem.frames)), initial_motion

@@ -107,7 +107,7 @@ def describe_twin(
     data there are. Rollouts are of at most ``particles`` of the twin's.
     """
     from masiv import runtime
-    from masiv.mpm.simulate import march, simulate
+    from masiv.simulation.simulate import march, simulate
 
     chosen = np.linspace(0, len(twin.positions) - 1, min(particles, len(twin.positions))).round().astype(int)
     few = replace(twin, positions=twin.positions[chosen], simulator=twin.simulator.model_copy(update={"split": 1}))

@@ -119,8 +119,10 @@ def _fit_pointwise(law: NeuralLaw, truth: Throw, iterations: int, seed: int, pro
         stress_error = _soft(((law.stress(f) - tau) / stress_scale).flatten(1))
         flow_error = _soft(((out @ out.mT - f @ f.mT) / flowed).flatten(1))
         # What the flow erases at once has no modulus to learn: let it be small, or it would set the substep.
-        unseen = 1e-3 * (law.moduli(strain_invariants(f))[:, :2] / law.log_stress_scale.detach().exp()).mean()
-        loss = stress_error + flow_error + unseen
+        identifiability_issue = (
+            1e-3 * (law.moduli(strain_invariants(f))[:, :2] / law.log_stress_scale.detach().exp()).mean()
+        )
+        loss = stress_error + flow_error + identifiability_issue
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -40,7 +40,7 @@ class RefineConfig(BaseModel):
         description="residual, over what noise and grid explain, from which something is missing: a further effect is "
         "looked for, and where none is found, it is called unexplained",
     )  # fmt: skip
-    second_look: bool = Field(
+    search_second_effect: bool = Field(
         True, description="with a cause found and less than ``unexplained`` left, look for one of one number beside it"
     )
     least_explained: float = Field(0.1, ge=0, le=1, description="share of the residual below which none is tried")

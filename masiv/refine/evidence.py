@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
-from masiv.refine.certainty import certain_instants, certainty
+from masiv.inference.model_fit import ModelFit
+from masiv.inference.significance import observation_limited, wald_z_gls
+from masiv.models.base import EffectTerm, Observation
 from masiv.refine.config import RefineConfig
-from masiv.refine.refit import Fitted
-from masiv.refine.simulated import Term, Watched
 
 SIMPLER = 0.25
 """Variance, over that of noise and grid, that tells nothing."""
 
 
 @dataclass(frozen=True)
-class Phases:
+class ReducedChi:
     """Means over fitted instants: those that are simulated as well as they are observed, and the others. None: there
     are none of that kind."""
 
@@ -31,59 +31,65 @@ class Phases:
         return max(mean for mean in (self.certain, self.uncertain) if mean is not None)
 
 
-def phases(ratios: Sequence[np.ndarray], experiments: Sequence[Watched]) -> Phases:
+def reduced_chi_by_regime(ratios: Sequence[np.ndarray], observations: Sequence[Observation]) -> ReducedChi:
     """Of ``ratios`` (K,) of each experiment over its instants."""
     certain, uncertain = [], []
-    for ratio, e in zip(ratios, experiments, strict=True):
-        known = certain_instants(e)
-        certain.append(ratio[: e.rows][known])
-        uncertain.append(ratio[: e.rows][~known])
+    for ratio, e in zip(ratios, observations, strict=True):
+        known = observation_limited(e)
+        certain.append(ratio[: e.fit_count][known])
+        uncertain.append(ratio[: e.fit_count][~known])
     means = (float(part.mean()) if len(part) else None for part in map(np.concatenate, (certain, uncertain)))
-    return Phases(*means)
+    return ReducedChi(*means)
 
 
-def excess(fitted: Fitted, experiments: Sequence[Watched]) -> float:
+def reduced_chi(fitted: ModelFit, observations: Sequence[Observation]) -> float:
     """Root mean square residual over the fitted instants in units of sigma, in the phase of the motion (well known, or
     not) where it is largest: about 1 where nothing is missing."""
-    ratios = [s / e.sigma**2 for s, e in zip(fitted.squares, experiments, strict=True)]
-    return math.sqrt(phases(ratios, experiments).largest)
+    ratios = [s / e.residual_std**2 for s, e in zip(fitted.squares, observations, strict=True)]
+    return math.sqrt(reduced_chi_by_regime(ratios, observations).largest)
 
 
-def above_noise(fitted: Fitted, experiments: Sequence[Watched], config: RefineConfig) -> bool:
+def above_noise(fitted: ModelFit, observations: Sequence[Observation], config: RefineConfig) -> bool:
     """Whether the residual over the fitted instants is above the noise of the observation, or that over the held-out
     ones above what noise and grid explain: what a law and a throw make up for at first shows there."""
-    squares = np.concatenate([(s / e.noise**2)[: e.rows] for s, e in zip(fitted.squares, experiments, strict=True)])
-    rest = held_out(fitted, experiments)
+    squares = np.concatenate(
+        [(s / e.noise_std**2)[: e.fit_count] for s, e in zip(fitted.squares, observations, strict=True)]
+    )
+    rest = held_out(fitted, observations)
     explained = not len(rest) or math.sqrt(float(rest.mean())) <= config.unexplained
     return math.sqrt(float(squares.mean())) > config.above_noise or not explained
 
 
-def simplest(passing: Sequence[Fitted], experiments: Sequence[Watched], *, whole: bool = False) -> Fitted | None:
+def simplest(
+    passing: Sequence[ModelFit], observations: Sequence[Observation], *, whole: bool = False
+) -> ModelFit | None:
     """Of fits, best first, the one with the fewest parameters (those held at a guess included) that explains what the
     best one does, but for less than noise and grid could change. whole: of the held-out instants, too."""
 
-    def lacks(fitted: Fitted) -> float:
-        squares = zip(fitted.squares, passing[0].squares, experiments, strict=True)
-        largest = phases([(mine - best) / e.sigma**2 for mine, best, e in squares], experiments).largest
-        if not whole or not any(e.holds_out for e in experiments):
+    def lacks(fitted: ModelFit) -> float:
+        squares = zip(fitted.squares, passing[0].squares, observations, strict=True)
+        largest = reduced_chi_by_regime(
+            [(mine - best) / e.residual_std**2 for mine, best, e in squares], observations
+        ).largest
+        if not whole or not any(e.holds_out for e in observations):
             return largest
-        return max(largest, float((held_out(fitted, experiments) - held_out(passing[0], experiments)).mean()))
+        return max(largest, float((held_out(fitted, observations) - held_out(passing[0], observations)).mean()))
 
     return min((f for f in passing if lacks(f) < SIMPLER), key=lambda f: len(f.values), default=None)
 
 
 def objections(
-    before: Fitted, after: Fitted, term: Term, experiments: Sequence[Watched], config: RefineConfig
+    before: ModelFit, after: ModelFit, term: EffectTerm, observations: Sequence[Observation], config: RefineConfig
 ) -> list[str]:
     """Why ``term`` is not accepted; empty where it is."""
     out = []
     gain = before.bic(after.samples) - after.bic(after.samples)
-    fall = gain + foretold(before, after, experiments)
+    fall = gain + log_predictive_gain(before, after, observations)
     if fall < config.least_bic:
         out.append(f"the information criterion falls by {fall:.1f}, less than {config.least_bic:g}")
     adapts = len(term.parameters) > 1 or gain < config.clear_bic
     out += explains_too_little(
-        before, after, experiments, config, adapts=adapts, sure=lambda: certainty(after, term, experiments)
+        before, after, observations, config, adapts=adapts, sure=lambda: wald_z_gls(after, term, observations)
     )  # fmt: skip
     sigmas = sigmas_from_zero(after, term)
     if not sigmas >= config.least_sigmas:
@@ -91,7 +97,7 @@ def objections(
     return out + beyond_possible(after, term)
 
 
-def beyond_possible(after: Fitted, term: Term) -> list[str]:
+def beyond_possible(after: ModelFit, term: EffectTerm) -> list[str]:
     """Which parameters of ``term`` ran into the bound of what is possible, as objections."""
     # What acts on the matter at a place may well be at the body's face, where its place ends.
     bounded = term.strengths if effect_named(term.effect).inside else term.parameters
@@ -102,11 +108,11 @@ def beyond_possible(after: Fitted, term: Term) -> list[str]:
     ]
 
 
-def sigmas_from_zero(fitted: Fitted, term: Term) -> float:
+def sigmas_from_zero(fitted: ModelFit, term: EffectTerm) -> float:
     """How many standard errors the strength of ``term`` is from none, its places and frequencies held where they are.
 
     A strength and a place may make up for each other (a lighter mass farther out), so that neither is well known
-    while it is plain that something is there. ``Fitted.stderr`` is of each with all else free.
+    while it is plain that something is there. ``ModelFit.stderr`` is of each with all else free.
     """
     held = {p.name for p in term.others}
     lengths = np.maximum(np.linalg.norm(fitted.jacobian, axis=0), 1e-300)
@@ -123,7 +129,7 @@ def sigmas_from_zero(fitted: Fitted, term: Term) -> float:
 
 
 def explains_too_little(
-    before: Fitted, after: Fitted, experiments: Sequence[Watched], config: RefineConfig,
+    before: ModelFit, after: ModelFit, observations: Sequence[Observation], config: RefineConfig,
     *, adapts: bool = True, sure: Callable[[], float | None] = lambda: None,
 ) -> list[str]:  # fmt: skip
     """What fitted and held-out instants, weighted alike, say against ``after``.
@@ -137,11 +143,11 @@ def explains_too_little(
     its error, and held-out instants then repeat what the last fitted ones said.
     """
     # Variance that it removes, over that which noise and grid would explain.
-    gained = [(b - a) / e.sigma**2 for b, a, e in zip(before.squares, after.squares, experiments, strict=True)]
-    fitted = phases(gained, experiments)
+    gained = [(b - a) / e.residual_std**2 for b, a, e in zip(before.squares, after.squares, observations, strict=True)]
+    fitted = reduced_chi_by_regime(gained, observations)
     share = fitted.largest
     little = f"it explains {max(share, 0.0):.2g} of what noise and a finer grid alone could change"
-    was, now = held_out(before, experiments), held_out(after, experiments)
+    was, now = held_out(before, observations), held_out(after, observations)
     if not len(was):
         return [] if share >= 1 else [little]
     won, removed = was - now, removed_of(was, now)
@@ -158,35 +164,37 @@ def explains_too_little(
     return [little] * (share < 1) + [there]
 
 
-def held_out(fitted: Fitted, experiments: Sequence[Watched]) -> np.ndarray:
-    """Squares over those of noise and grid at the held-out instants of all ``experiments``."""
+def held_out(fitted: ModelFit, observations: Sequence[Observation]) -> np.ndarray:
+    """Squares over those of noise and grid at the held-out instants of all ``observations``."""
     parts = [
-        (squares / e.sigma**2)[e.rows :] for squares, e in zip(fitted.squares, experiments, strict=True) if e.holds_out
+        (squares / e.residual_std**2)[e.fit_count :]
+        for squares, e in zip(fitted.squares, observations, strict=True)
+        if e.holds_out
     ]
     return np.concatenate(parts) if parts else np.zeros(0)
 
 
-def foretold(before: Fitted, after: Fitted, experiments: Sequence[Watched]) -> float:
+def log_predictive_gain(before: ModelFit, after: ModelFit, observations: Sequence[Observation]) -> float:
     """By how much more the information criterion falls for what no fit saw (Dawid's prequential likelihood, J. R. Stat.
     Soc. A 147, 1984). The held-out instants of an experiment are one sample, since they share one error that grows; of
     an error within noise and grid there is nothing to foretell."""
     out = 0.0
-    for was, now, e in zip(before.squares, after.squares, experiments, strict=True):
+    for was, now, e in zip(before.squares, after.squares, observations, strict=True):
         if e.holds_out:
-            was, now = (max(float((s / e.sigma**2)[e.rows :].mean()), 1.0) for s in (was, now))
+            was, now = (max(float((s / e.residual_std**2)[e.fit_count :].mean()), 1.0) for s in (was, now))
             out += math.log(was / now)
     return out
 
 
-def all_instants(fitted: Fitted, experiments: Sequence[Watched]) -> float:
+def all_instants(fitted: ModelFit, observations: Sequence[Observation]) -> float:
     """Sum of squares over those of noise and grid, fitted and held-out instants alike."""
-    return sum(float((s / e.sigma**2).sum()) for s, e in zip(fitted.squares, experiments, strict=True))
+    return sum(float((s / e.residual_std**2).sum()) for s, e in zip(fitted.squares, observations, strict=True))
 
 
-def foretelling(fits: Sequence[Fitted], experiments: Sequence[Watched]) -> Fitted:
+def select_by_validation(fits: Sequence[ModelFit], observations: Sequence[Observation]) -> ModelFit:
     """Of fits of several laws, the simplest that explains fitted and held-out instants about as well as the best."""
-    best_first = sorted(fits, key=lambda f: all_instants(f, experiments))
-    return simplest(best_first, experiments, whole=True) or best_first[0]
+    best_first = sorted(fits, key=lambda f: all_instants(f, observations))
+    return simplest(best_first, observations, whole=True) or best_first[0]
 
 
 def removed_of(was: np.ndarray, now: np.ndarray) -> float:

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from masiv.refine.refit import Fitted
-from masiv.refine.score import Candidate, alike
+from masiv.inference.model_fit import ModelFit
+from masiv.refine.candidates import Candidate, alike
 
 TELLS_APART = 6.0
 """Difference of the information criterion below which two refits explain the data equally well."""
@@ -18,7 +18,7 @@ class Trial:
     """An effect that was fitted through the rollout, and why it was or was not accepted."""
 
     candidate: Candidate
-    fitted: Fitted
+    fitted: ModelFit
     reasons: list[str] = field(default_factory=list)
 
     @property
@@ -31,12 +31,12 @@ class Round:
     """One pass: what was tried on top of which model. or_else: effects that may as well be there in place of the
     accepted one, as far as this motion tells."""
 
-    base: Fitted
+    base: ModelFit
     candidates: list[Candidate]
     trials: list[Trial]
     accepted: Trial | None
     confusable: dict[str, list[str]]
-    or_else: list[str] = field(default_factory=list)
+    indistinguishable_from: list[str] = field(default_factory=list)
 
 
 def confusable(ranking: Sequence[Candidate], trials: Sequence[Trial], least: float) -> dict[str, list[str]]:
@@ -64,5 +64,5 @@ def like_accepted(name: str, rounds: Sequence[Round]) -> dict[str, list[str]]:
     found = [r for r in rounds if r.accepted is not None and r.accepted.candidate.effect == name]
     return {
         "confusable_with": found[0].confusable.get(name, []) if found else [],
-        "or_else": found[0].or_else if found else [],
+        "or_else": found[0].indistinguishable_from if found else [],
     }

@@ -11,17 +11,17 @@ from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.effects.catalogue import effect_named
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.families import law_of
+from masiv.inference.model_fit import ModelFit
+from masiv.models.families import law_of
+from masiv.models.free_body import Simulation, effect_parameters, initial_state_of
+from masiv.models.prepare import video_observation
 from masiv.mpm.config import SimulatorConfig
+from masiv.observations.motion import Observed, first_frames
 from masiv.progress import Progress, silent
 from masiv.refine.baselines import baselines
 from masiv.refine.config import RefineConfig
-from masiv.refine.loop import Outcome, close_loop
-from masiv.refine.model import Simulation, effect_parameters, throw_of
-from masiv.refine.observed import Observed, first_frames
-from masiv.refine.prepare import experiment_of
-from masiv.refine.propose import Proposal, propose
-from masiv.refine.refit import Fitted
+from masiv.refine.experiment_design import Proposal, propose
+from masiv.refine.search import SearchResult, search_effects
 from masiv.scene.scene import Scene
 from masiv.twin import Twin, TwinEffect
 from masiv.workers import Workers, processes_wanted
@@ -53,7 +53,7 @@ class Refined:
     """What was found. fields: residuals before and after, simulated less observed, (K, N, 3) [m, simulation frame] of
     each throw over all frames, at ``samples_per_frame`` instants a frame."""
 
-    outcome: Outcome
+    result: SearchResult
     simulation: Simulation
     before: list[np.ndarray]
     after: list[np.ndarray]
@@ -87,17 +87,17 @@ def refine(
         if not config.laws and start in COMPETITORS:
             config = config.model_copy(update={"laws": list(COMPETITORS[start])})
         made = [
-            experiment_of(t.name, t.scene, first_frames(t.motion, t.fitted), t.whole, identify, simulator, config)
+            video_observation(t.name, t.scene, first_frames(t.motion, t.fitted), t.whole, identify, simulator, config)
             for t in throws
         ]
-        simulation = Simulation([experiment for experiment, *_ in made])
-        _, few, fewer, launch = made[0]
+        simulation = Simulation([observation for observation, *_ in made])
+        _, coarse, coarser, initial_motion = made[0]
         with Workers(processes_wanted(config.processes)) as workers:
             fits = baselines(
                 simulation,
-                few,
-                fewer,
-                min(launch.last_frame + 2, few.frames),
+                coarse,
+                coarser,
+                min(initial_motion.last_frame + 2, coarse.frames),
                 config,
                 checkpoint or Checkpoint(None),
                 progress,
@@ -105,16 +105,16 @@ def refine(
             )
             if dry_run:
                 config = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
-            outcome = close_loop(simulation, fits, config, progress, workers)
-        proposal = None if dry_run else propose(simulation, outcome, progress)
-        return Refined(outcome, simulation, outcome.before.fields, (outcome.gap or outcome.after).fields, proposal)
+            result = search_effects(simulation, fits, config, progress, workers)
+        proposal = None if dry_run else propose(simulation, result, progress)
+        return Refined(result, simulation, result.before.fields, (result.gap or result.after).fields, proposal)
 
 
-def twin_of(fitted: Fitted, throw: Throw, simulation: Simulation, old: Twin) -> Twin:
+def twin_of(fitted: ModelFit, throw: Throw, simulation: Simulation, old: Twin) -> Twin:
     """``old`` with the law, throw, ground and effects of ``fitted``."""
-    experiment = simulation.experiments[0]
-    motion = throw_of(fitted.values, experiment)
-    axes = experiment.problem.axes
+    observation = simulation.observations[0]
+    motion = initial_state_of(fitted.values, observation)
+    axes = observation.problem.axes
     law = law_of(fitted.model.family, fitted.values)
     law.stderr = {n: fitted.stderr[n] for n in law.values if math.isfinite(fitted.stderr.get(n, math.inf))}
     effects = tuple(

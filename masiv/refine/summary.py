@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
+from masiv.inference.model_fit import ModelFit, rms_mm, split
+from masiv.models.free_body import GRID_CHANGE, VideoObservation, effect_parameters
 from masiv.refine.answer import answer
+from masiv.refine.candidates import Candidate
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import excess
-from masiv.refine.loop import STOP_GAP
-from masiv.refine.model import GRID_CHANGE, Experiment, effect_parameters
-from masiv.refine.refit import Fitted, rms_mm, split
+from masiv.refine.evidence import reduced_chi
 from masiv.refine.rounds import Round, like_accepted
-from masiv.refine.score import Candidate
+from masiv.refine.search import DISCREPANCY_FORCE
 from masiv.refine.stage import Refined
 
 ADDED, NOTHING, UNEXPLAINED = "effect added", "nothing missing", "unexplained residual"
@@ -23,42 +23,42 @@ ADDED, NOTHING, UNEXPLAINED = "effect added", "nothing missing", "unexplained re
 
 def verdict(found: Refined, config: RefineConfig) -> str:
     """What the search came to."""
-    after = found.outcome.after
-    if excess(after, found.simulation.experiments) > config.unexplained:
+    after = found.result.after
+    if reduced_chi(after, found.simulation.observations) > config.unexplained:
         return UNEXPLAINED
     return ADDED if after.model.effects else NOTHING
 
 
 def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str, Any]:
     """The document; ``before`` and ``after`` hold the motion's error, pictures are added by whoever has them."""
-    outcome = found.outcome
-    first = outcome.rounds[0] if outcome.rounds else None
+    result = found.result
+    first = result.rounds[0] if result.rounds else None
     proposal = found.proposal
-    experiments = found.simulation.experiments
-    experiment = experiments[0]
+    observations = found.simulation.observations
+    observation = observations[0]
     return {
         "schema": 1,
-        "noise_floor_mm": 1e3 * experiment.noise,
-        "grid_floor_mm": _grid_floor(experiment),
+        "noise_floor_mm": 1e3 * observation.noise_std,
+        "grid_floor_mm": _grid_floor(observation),
         "grid_share": {
-            "before": _grid_share(outcome.before, experiment), "after": _grid_share(outcome.after, experiment)
+            "before": _grid_share(result.before, observation), "after": _grid_share(result.after, observation)
         },
         "residual_over_floor": {
-            "before": excess(outcome.before, experiments), "after": excess(outcome.after, experiments)
+            "before": reduced_chi(result.before, observations), "after": reduced_chi(result.after, observations)
         },
-        "residual_mm": {"fit": outcome.before.fit_mm, "held_out": outcome.before.held_out_mm},
+        "residual_mm": {"fit": result.before.fit_mm, "held_out": result.before.held_out_mm},
         "candidates": [_candidate(c, first) for c in first.candidates] if first else [],
         "accepted": [
-            {**_accepted(name, outcome.after), **like_accepted(name, outcome.rounds)}
-            for name in outcome.after.model.effects
+            {**_accepted(name, result.after), **like_accepted(name, result.rounds)}
+            for name in result.after.model.effects
         ],
-        "stop_gap": None if outcome.gap is None else _stop_gap(outcome.gap),
+        "stop_gap": None if result.gap is None else _stop_gap(result.gap),
         "before": _errors(found, found.before),
         "after": _errors(found, found.after),
         "unexplained": unexplained(found),
         "verdict": "ranked only" if dry_run else verdict(found, config),
-        "laws": {"before": outcome.before.model.family.kind, "after": outcome.after.model.family.kind},
-        "rounds": [_round(r) for r in outcome.rounds],
+        "laws": {"before": result.before.model.family.kind, "after": result.after.model.family.kind},
+        "rounds": [_round(r) for r in result.rounds],
         "next_experiment": None if proposal is None else {
             "tells_apart": list(proposal.between),
             "velocity": {"value": proposal.velocity.tolist(), "unit": "m/s"},
@@ -70,22 +70,26 @@ def summary(found: Refined, config: RefineConfig, *, dry_run: bool) -> dict[str,
     }  # fmt: skip
 
 
-def _grid_share(fitted: Fitted, experiment: Experiment) -> float | None:
+def _grid_share(fitted: ModelFit, observation: VideoObservation) -> float | None:
     """How much there is of what finer grids change on average."""
-    return fitted.values.get(f"{GRID_CHANGE}@{experiment.name}")
+    return fitted.values.get(f"{GRID_CHANGE}@{observation.name}")
 
 
-def _grid_floor(experiment: Experiment) -> dict[str, float | None]:
+def _grid_floor(observation: VideoObservation) -> dict[str, float | None]:
     """By how much one grid more may differ, root mean square [mm] over the fitted and the held-out instants."""
-    grid = experiment.sigma**2 - experiment.noise**2
-    rest = grid[experiment.rows :]
-    fit = 1e3 * math.sqrt(max(float(grid[: experiment.rows].mean()), 0.0))
+    grid = observation.residual_std**2 - observation.noise_std**2
+    rest = grid[observation.fit_count :]
+    fit = 1e3 * math.sqrt(max(float(grid[: observation.fit_count].mean()), 0.0))
     return {"fit": fit, "held_out": 1e3 * math.sqrt(max(float(rest.mean()), 0.0)) if len(rest) else None}
 
 
-def _stop_gap(fitted: Fitted) -> dict[str, Any]:
+def _stop_gap(fitted: ModelFit) -> dict[str, Any]:
     """A smooth force for what is unexplained; in no sense a cause."""
-    return {**_accepted(STOP_GAP, fitted), "fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}
+    return {
+        **_accepted(DISCREPANCY_FORCE, fitted),
+        "fit_rmse_mm": fitted.fit_mm,
+        "held_out_rmse_mm": fitted.held_out_mm,
+    }
 
 
 def _candidate(candidate: Candidate, first: Round) -> dict[str, Any]:
@@ -108,7 +112,7 @@ def _candidate(candidate: Candidate, first: Round) -> dict[str, Any]:
     }
 
 
-def _accepted(name: str, fitted: Fitted) -> dict[str, Any]:
+def _accepted(name: str, fitted: ModelFit) -> dict[str, Any]:
     own = effect_parameters(name)
     short = {p.name: p.name.split(".")[1] for p in own}
     return {
@@ -144,7 +148,7 @@ def _round(done: Round) -> dict[str, Any]:
 
 
 def _errors(found: Refined, fields: list[np.ndarray]) -> dict[str, Any]:
-    fit, rest = split(fields, found.simulation.experiments)
+    fit, rest = split(fields, found.simulation.observations)
     return {
         "fit": {"trajectory_rmse_mm": rms_mm(fit)},
         "held_out": {"trajectory_rmse_mm": rms_mm(rest)} if rest else {},
@@ -153,8 +157,8 @@ def _errors(found: Refined, fields: list[np.ndarray]) -> dict[str, Any]:
 
 def unexplained(found: Refined) -> dict[str, Any]:
     """What is left of the first throw's residual, and where and when it is largest."""
-    experiment = found.simulation.experiments[0]
-    problem = experiment.problem
+    observation = found.simulation.observations[0]
+    problem = observation.problem
     field = found.after[0]
     size = np.linalg.norm(field, axis=2)
     by_instant = 1e3 * np.sqrt((size**2).mean(1))
@@ -165,7 +169,7 @@ def unexplained(found: Refined) -> dict[str, Any]:
     where = (weight[:, None] * rest).sum(0) / max(weight.sum(), 1e-300)
     return {
         "rmse_mm": 1e3 * float(np.sqrt((size**2).mean())),
-        "noise_floor_mm": 1e3 * experiment.noise,
+        "noise_floor_mm": 1e3 * observation.noise_std,
         "worst_frame": (worst + 1) / problem.samples,
         "worst_frame_rmse_mm": float(by_instant[worst]),
         "rmse_mm_by_instant": by_instant.tolist(),

@@ -5,34 +5,34 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-from masiv.refine.refit import Fitted
-from masiv.refine.score import Candidate, score
-from masiv.refine.simulated import Simulated
-from masiv.workers import Workers, attempt, demanded
+from masiv.inference.model_fit import ModelFit
+from masiv.models.base import ForwardModel
+from masiv.refine.candidates import Candidate, score
+from masiv.workers import Workers, run_task, unwrap
 
 NAMES_A_TASK = 3
 
 
-def side_by_side(workers: Workers, simulation: Simulated, function: Callable, tasks: Iterable[tuple]) -> Iterator[Any]:
-    """``function(simulation, *task)`` of each task, in order, or ``Failed``; rollouts are counted."""
+def map_tasks(workers: Workers, simulation: ForwardModel, function: Callable, tasks: Iterable[tuple]) -> Iterator[Any]:
+    """``function(simulation, *task)`` of each task, in order, or ``TaskError``; rollouts are counted."""
     for found, rollouts in workers.map(_counted, [(function, simulation, *task) for task in tasks]):
         simulation.rollouts += rollouts
         yield found
 
 
-def _counted(function: Callable, simulation: Simulated, *task: Any) -> tuple[Any, int]:
+def _counted(function: Callable, simulation: ForwardModel, *task: Any) -> tuple[Any, int]:
     before = simulation.rollouts
-    out = attempt(function, (simulation, *task))
+    out = run_task(function, (simulation, *task))
     done, simulation.rollouts = simulation.rollouts - before, before
     return out, done
 
 
 def ranked(
     workers: Workers,
-    simulation: Simulated,
-    base: Fitted,
+    simulation: ForwardModel,
+    base: ModelFit,
     *,
-    soft: float,
+    robust_scale: float,
     names: Sequence[str],
     progress: Callable[[str, int, int], None],
 ) -> list[Candidate]:
@@ -41,14 +41,14 @@ def ranked(
     out: list[Candidate] = []
     done = 0
     progress(parts[0][0] if parts else "", 0, len(names))
-    found = side_by_side(workers, simulation, _scored, [(base, soft, part) for part in parts])
+    found = map_tasks(workers, simulation, _scored, [(base, robust_scale, part) for part in parts])
     for part, candidates in zip(parts, found, strict=True):
-        out += demanded(candidates)
+        out += unwrap(candidates)
         done += len(part)
         progress(part[-1], done, len(names))
     place = {name: k for k, name in enumerate(names)}
     return sorted(out, key=lambda c: (-c.explained, place[c.effect]))
 
 
-def _scored(simulation: Simulated, base: Fitted, soft: float, names: list[str]) -> list[Candidate]:
-    return score(simulation, base, soft=soft, names=names)
+def _scored(simulation: ForwardModel, base: ModelFit, robust_scale: float, names: list[str]) -> list[Candidate]:
+    return score(simulation, base, robust_scale=robust_scale, names=names)

@@ -37,7 +37,7 @@ def film(
     binding = Binding.at_rest(gaussians, motion[0])
     tile = float(np.ptp(motion[0], axis=0).max()) / 2
     backgrounds = [backdrop(scene.cameras[view], scene.up, scene.ground, tile) for view in views]
-    side_by_side = []
+    map_tasks = []
     for frame, particles in enumerate(motion):
         now = binding.moved(particles)
         pictures = []
@@ -45,9 +45,9 @@ def film(
             picture, _ = draw(now, scene.cameras[view], background)
             write_png(out / "views" / f"{view}_{frame:03d}.png", picture)
             pictures.append(picture)
-        side_by_side.append(joined(pictures))
+        map_tasks.append(joined(pictures))
         progress("render", frame + 1, len(motion))
-    write_video(out / "video.mp4", side_by_side, scene.fps)
+    write_video(out / "video.mp4", map_tasks, scene.fps)
 
 
 def balls(particles: np.ndarray, volume: float) -> Gaussians:

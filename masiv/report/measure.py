@@ -10,9 +10,9 @@ import numpy as np
 
 from masiv import metrics
 from masiv.errors import InputError
-from masiv.mpm.split import wholes
 from masiv.report.draw import draw, on_black
 from masiv.scene.scene import Ground, Scene
+from masiv.simulation.subdivide import wholes
 from masiv.splat.gaussians import Gaussians
 
 UNITS = {

@@ -145,11 +145,11 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
     for turn, done in enumerate(rounds, start=1):
         for refit in done["refits"]:
             values = ", ".join(f"{words(n)} {number(_number(q['value']))}" for n, q in refit["parameters"].items())
-            outcome = "accepted" if refit["accepted"] else "; ".join(refit["objections"]) or "another was better"
+            result = "accepted" if refit["accepted"] else "; ".join(refit["objections"]) or "another was better"
             rows.append([
                 turn, ", ".join(map(words, [*done["base"]["effects"], refit["effect"]])), words(refit["law"]),
                 _number(refit["fit_rmse_mm"]), _number(refit["held_out_rmse_mm"]),
-                _number(refit["information_gain"]), values, outcome,
+                _number(refit["information_gain"]), values, result,
             ])  # fmt: skip
     if not rows:
         return

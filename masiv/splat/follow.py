@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from masiv.checkpoint import Checkpoint
-from masiv.continuum.carve import visual_hull
-from masiv.continuum.settle import settled_hull
 from masiv.errors import InputError, MasivError
+from masiv.hull.carve import visual_hull
+from masiv.hull.settle import settled_hull
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.config import ReconstructConfig

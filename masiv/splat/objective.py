@@ -12,7 +12,7 @@ from masiv.scene.scene import Ground
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.losses import Pairs, ssim, strain
-from masiv.splat.observe import Observation
+from masiv.splat.observed_image import ObservedImage
 from masiv.splat.pull import HullPull
 from masiv.splat.rasteriser import render
 
@@ -48,7 +48,7 @@ class Objective:
     fps: float
     ground: Ground | None
     hulls: Sequence[HullPull] | Mapping[int, HullPull]
-    observations: Sequence[list[Observation]] | Mapping[int, list[Observation]]
+    observations: Sequence[list[ObservedImage]] | Mapping[int, list[ObservedImage]]
 
     def __call__(
         self,
@@ -146,7 +146,7 @@ class Objective:
         return total
 
     def _difference(
-        self, rgb: torch.Tensor, alpha: torch.Tensor, view: Observation, background: torch.Tensor
+        self, rgb: torch.Tensor, alpha: torch.Tensor, view: ObservedImage, background: torch.Tensor
     ) -> torch.Tensor:
         """(1 - l) L1 + l (1 - SSIM) over the background, plus alpha against the mask; what an occluder hides agrees."""
         c = self.config

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from masiv.continuum.carve import VisualHull
+from masiv.hull.carve import VisualHull
 from masiv.splat.deformation import DeformationNetwork
 
 _CATCH_UP_STEPS = 60

@@ -21,7 +21,7 @@ from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.gaussians import Gaussians
 from masiv.splat.losses import neighbour_pairs
 from masiv.splat.objective import NAMES, Objective, Part
-from masiv.splat.observe import Observation, observe
+from masiv.splat.observed_image import ObservedImage, observed_image
 from masiv.splat.pull import HullPull, continue_motion
 from masiv.splat.share import Second, leaves, slopes
 from masiv.splat.start import Start, starting_point
@@ -239,12 +239,12 @@ class _Fit:
         self._find_neighbours()
 
 
-def observations(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[list[Observation]]:
+def observations(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[list[ObservedImage]]:
     """What each of ``frames`` shows. Raises MasivError for a frame that no view sees the object in."""
     found = []
     for frame in frames:
         of_frame = [
-            observe(scene, view, frame, crop_side=config.crop_side, crop_padding=config.crop_padding)
+            observed_image(scene, view, frame, crop_side=config.crop_side, crop_padding=config.crop_padding)
             for view in scene.views
         ]
         found.append([o for o in of_frame if o is not None])

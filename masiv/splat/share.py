@@ -22,7 +22,7 @@ from masiv.errors import MasivError
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.losses import Pairs
 from masiv.splat.objective import NAMES, Objective, Part
-from masiv.workers import ONE_THREAD, attempt, demanded
+from masiv.workers import ONE_THREAD, run_task, unwrap
 
 Slopes = Sequence[torch.Tensor | None]
 CLOSING_S = 10.0
@@ -97,7 +97,7 @@ class Second:
     def end(self) -> tuple[float, Slopes]:
         """What ``slopes`` gives for the part that was begun. Raises MasivError, also where the process has died."""
         try:
-            loss, known = demanded(pickle.load(self._process.stdout))  # type: ignore[arg-type]
+            loss, known = unwrap(pickle.load(self._process.stdout))  # type: ignore[arg-type]
         except (EOFError, pickle.UnpicklingError) as died:
             raise _died() from died
         found = _views(self._slopes, [leaf.shape for leaf in self._leaves])
@@ -167,7 +167,7 @@ def _serve(file: int, threads: int) -> None:
         if server is None:
             server = _Server(file, *message)
             continue
-        pickle.dump(attempt(server.compute, message), answers)
+        pickle.dump(run_task(server.compute, message), answers)
         answers.flush()
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from masiv.continuum.carve import VisualHull, visual_hull
-from masiv.continuum.settle import settled_hull
 from masiv.errors import MasivError
+from masiv.hull.carve import VisualHull, visual_hull
+from masiv.hull.settle import settled_hull
 from masiv.scene.scene import Scene
 
 

@@ -79,7 +79,7 @@ def _effects(spec: SynthSpec, rest, volume: float) -> ActiveEffects:
 
     from masiv.effects.active import ActiveEffects
     from masiv.effects.catalogue import effect_named
-    from masiv.effects.effect import Setting
+    from masiv.effects.effect import EffectContext
 
     members = []
     for name, given in spec.effects.items():
@@ -95,7 +95,7 @@ def _effects(spec: SynthSpec, rest, volume: float) -> ActiveEffects:
             if p.name in given and not p.lower <= given[p.name] <= p.upper:
                 raise InputError(f"effects.{name}.{p.name} is outside of {p.lower:g} to {p.upper:g} {p.unit}")
         members.append((effect, torch.tensor([given.get(n, 0.0) for n in known])))
-    setting = Setting(
+    setting = EffectContext(
         gravity=torch.tensor(spec.gravity),
         rest=rest,
         particle_mass=spec.material.density * volume / len(rest),

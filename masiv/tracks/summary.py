@@ -80,7 +80,7 @@ def identity(tracks: Tracks) -> dict[str, Any]:
 
 
 def _run(run: Run) -> dict[str, Any]:
-    noise = run.noise
+    noise = run.noise_std
     measured = "".join(axis for axis, known in zip("xyz", run.axes.any(axis=0), strict=True) if known)
     return {
         "name": run.name,

@@ -47,7 +47,7 @@ class Run:
 
     positions (T, M, 3), NaN where nothing was measured; times (T,) as in the file, increasing; rate [Hz]; purpose: fit
     or hold_out; rest: frames at rest before the release; at_rest (M, 3): where markers are then (in the first frame
-    that shows them, without rest frames), NaN for what was not measured; noise (M, 3): standard deviation of each axis
+    that shows them, without rest frames), NaN for what was not measured; noise_std (M, 3): standard deviation of each axis
     at rest (None: without two rest frames); release [s]: when the body is let go (None: not known); placement: the
     body's own axes -> world at rest (None: no geometry); unsteady [s]: how long after the release it is not compared.
     """
@@ -62,7 +62,7 @@ class Run:
     rate: float
     rest: slice | None
     at_rest: np.ndarray
-    noise: np.ndarray | None
+    noise_std: np.ndarray | None
     release: float | None
     placement: Placement | None
     unsteady: float = 0.0
@@ -136,7 +136,7 @@ class Tracks:
 
 
 def rest_of(positions: np.ndarray, rest: slice | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """``at_rest`` and ``noise`` of a ``Run`` with positions (T, M, 3) [m]."""
+    """``at_rest`` and ``noise_std`` of a ``Run`` with positions (T, M, 3) [m]."""
     if rest is None:
         first = np.argmax(np.isfinite(positions), axis=0)
         return np.take_along_axis(positions, first[None], axis=0)[0], None

@@ -12,9 +12,9 @@ import yaml
 
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
+from masiv.inference.model_fit import ModelFit
 from masiv.materials.classical import UNITS
-from masiv.refine.refit import Fitted
-from masiv.refine.simulated import Term
+from masiv.models.base import EffectTerm
 from masiv.strict import read_yaml
 
 SCHEMA = 1
@@ -123,7 +123,7 @@ def _known(error: float | None) -> float | None:
     return None if error is None or error == float("inf") else float(error)
 
 
-def law_parameters(fitted: Fitted, known: Mapping[str, float]) -> Parameters:
+def law_parameters(fitted: ModelFit, known: Mapping[str, float]) -> Parameters:
     """The law of ``fitted``, what was not fitted without an error."""
     out: Parameters = {n: (v, UNITS[n], None) for n, v in known.items() if n in UNITS}
     for p in fitted.model.family.parameters:
@@ -132,7 +132,7 @@ def law_parameters(fitted: Fitted, known: Mapping[str, float]) -> Parameters:
 
 
 def found_effect(
-    term: Term, fitted: Fitted, condition: str | None, place: tuple[float, float, float] | None = None
+    term: EffectTerm, fitted: ModelFit, condition: str | None, place: tuple[float, float, float] | None = None
 ) -> FoundEffect:
     """A term of ``fitted``."""
     parameters: Parameters = {}
@@ -142,7 +142,7 @@ def found_effect(
     return FoundEffect(term.effect, term.bodies, condition, parameters, place)
 
 
-def starts_of(fitted: Fitted) -> dict[str, float]:
+def starts_of(fitted: ModelFit) -> dict[str, float]:
     """What of ``fitted`` belongs to single runs: names such as ``release@run``."""
     mine = {p.name for p in fitted.model.family.parameters}
     of_effects = tuple(fitted.model.effects)

@@ -1,0 +1,1 @@
+"""Visual hulls from silhouettes."""

@@ -1,0 +1,145 @@
+"""Visual hull: the volume that projects into every silhouette of a frame (Laurentini 1994)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from masiv.errors import MasivError
+from masiv.hull.silhouette import Silhouette, silhouettes
+from masiv.scene.scene import Ground, Scene
+
+_COARSE = 24
+_BOX_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class VisualHull:
+    """Occupied voxels of a regular lattice.
+
+    points (M, 3) float64 centres [m, world]; spacing [m]; surface (M,) bool, voxels with an empty 6-neighbour.
+    """
+
+    points: np.ndarray
+    spacing: float
+    surface: np.ndarray
+
+    @property
+    def volume(self) -> float:
+        """Volume of the hull [m³]."""
+        return len(self.points) * self.spacing**3
+
+
+def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull:
+    """Carve the object of ``frame`` from the masks that ``scene`` may look at.
+
+    The box is found from the masks alone; its longest side gets ``resolution`` voxels. A voxel is kept where no view
+    whose image shows it says that it is outside of the mask (by more than a quarter voxel, so that thin parts survive),
+    and where at least half of the views, two or more, have it in their image. Raises MasivError when nothing is left.
+    """
+    views = silhouettes(scene, frame)
+    seen = [v for v in views if (v.distance < 0).any()]
+    if len(seen) < 2:
+        raise MasivError(
+            f"frame {frame} of {scene.path}: the object is in the mask of {len(seen)} of {len(views)} views, a visual "
+            "hull needs 2; check the masks of that frame"
+        )
+    lower, upper = _object_box(views, seen, scene.ground, frame, scene)
+    spacing = float((upper - lower).max()) / resolution
+    counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
+    grid = _cell_centres(lower, spacing, counts)
+    occupied = occupancy(views, grid, 0.25 * spacing, scene.ground).reshape(counts)
+    if not occupied.any():
+        raise MasivError(_nothing_left(views, seen, scene, frame))
+    return VisualHull(grid[occupied.ravel()], spacing, surface_of(occupied)[occupied])
+
+
+def occupancy(
+    views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float, ground: Ground | None = None
+) -> np.ndarray:
+    """Which world points (N, 3) [m] no view rules out: within ``tolerance`` [m] of every silhouette, above the ground.
+
+    A point must be in the image of at least two views and of half of them. Returns (N,) bool.
+    """
+    kept = np.ones(len(points), bool)
+    if ground is not None:
+        kept &= points @ ground.normal >= ground.height - 0.5 * tolerance
+    shown = np.zeros(len(points), np.int32)
+    for view in views:
+        alive = np.flatnonzero(kept)
+        distance, inside_image, _ = view.outside(points[alive])
+        shown[alive] += inside_image
+        kept[alive] = distance <= tolerance
+    return kept & (shown >= max(2, len(views) // 2))
+
+
+def surface_of(occupied: np.ndarray) -> np.ndarray:
+    """Cells (I, J, K) bool that are occupied and have an empty neighbour among six (the box's outside is empty)."""
+    return occupied & ~ndimage.binary_erosion(occupied)
+
+
+def _object_box(views, seen, ground, frame: int, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest box of the hull, by carving coarse grids that shrink. Returns its corners (3,), (3,) [m]."""
+    centre = _nearest_to_rays(seen)
+    radius = max(_radius_around(view, centre) for view in seen)
+    lower, upper = centre - radius, centre + radius
+    for _ in range(_BOX_ROUNDS):
+        spacing = float((upper - lower).max()) / _COARSE
+        counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
+        grid = _cell_centres(lower, spacing, counts)
+        # Half of a cell's diagonal: no cell that holds a piece of the object is lost.
+        kept = grid[occupancy(views, grid, 0.87 * spacing, ground)]
+        if len(kept) == 0:
+            raise MasivError(_nothing_left(views, seen, scene, frame))
+        lower, upper = (
+            np.maximum(lower, kept.min(axis=0) - 0.5 * spacing),
+            np.minimum(upper, kept.max(axis=0) + 0.5 * spacing),
+        )
+    return lower, upper
+
+
+def _cell_centres(lower: np.ndarray, spacing: float, counts: np.ndarray) -> np.ndarray:
+    axes = [lower[k] + (np.arange(counts[k]) + 0.5) * spacing for k in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _nearest_to_rays(seen: list[Silhouette]) -> np.ndarray:
+    """The point (3,) [m] nearest, in least squares, to the rays through the centroids of the masks."""
+    normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
+    for view in seen:
+        rows, columns = np.nonzero(view.distance < 0)
+        pixel = np.array([columns.mean() + 0.5, rows.mean() + 0.5, 1.0])
+        direction = view.camera.world_to_camera[:3, :3].T @ np.linalg.solve(view.camera.intrinsics, pixel)
+        direction /= np.linalg.norm(direction)
+        across = np.eye(3) - np.outer(direction, direction)
+        normal_matrix += across
+        right_side += across @ view.camera.centre
+    return np.linalg.lstsq(normal_matrix, right_side, rcond=None)[0]
+
+
+def _radius_around(view: Silhouette, centre: np.ndarray) -> float:
+    """Distance [m] from ``centre`` to the farthest mask pixel of this view, at the centre's depth."""
+    pixel, depth = view.camera.project(centre[None])
+    rows, columns = np.nonzero(view.distance < 0)
+    reach = np.hypot(columns + 0.5 - pixel[0, 0], rows + 0.5 - pixel[0, 1]).max()
+    return float((reach + 1.0) * abs(depth[0]) / min(view.camera.intrinsics[0, 0], view.camera.intrinsics[1, 1]))
+
+
+def _nothing_left(views, seen: list[Silhouette], scene: Scene, frame: int) -> str:
+    """Say which view contradicts the others most: the one whose absence leaves the largest volume."""
+    centre = _nearest_to_rays(seen)
+    radius = max(_radius_around(view, centre) for view in seen)
+    spacing = 2 * radius / _COARSE
+    grid = _cell_centres(centre - radius, spacing, np.full(3, _COARSE))
+    left = {
+        view.view: int(occupancy(tuple(v for v in views if v is not view), grid, 0.5 * spacing, scene.ground).sum())
+        for view in views
+    }
+    worst = max(left, key=lambda view: left[view])
+    hint = f" (view {worst} contradicts the others: look at its mask first)" if left[worst] > 0 else ""
+    return (
+        f"frame {frame} of {scene.path}: no volume is inside the masks of all {len(views)} views{hint}; "
+        "check the masks of that frame, the camera poses and the ground plane"
+    )

@@ -1,0 +1,1 @@
+"""Fits of few parameters, noise models, evidence."""

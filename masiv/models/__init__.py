@@ -1,0 +1,1 @@
+"""Forward models: parameters -> positions at the points and times of an observation."""

@@ -1,0 +1,159 @@
+"""The classical families that can be fitted: their parameters, where to look for them, and what they make of a motion.
+
+The five of PAC-NeRF (Li et al. 2023) and GIC (Cai et al. 2024). Light searches start from the values here, given for
+1000 kg/m^3: what moves a body is a modulus over its density.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from masiv.errors import InputError, MasivError, NonFiniteError
+from masiv.inference.least_squares import Parameter
+from masiv.materials.classical import UNITS, ClassicalLaw
+from masiv.models.problem import InitialState, Problem
+
+MODULUS = Parameter("youngs_modulus", 3e4, 3e2, 1e7, 0.05, log=True)
+RATIO = Parameter("poissons_ratio", 0.3, 0.0, 0.48, 0.01)
+YIELD = Parameter("yield_stress", 1e3, 3.0, 1e6, 0.05, log=True)
+
+
+@dataclass(frozen=True)
+class Family:
+    """parameters of a ``ClassicalLaw`` and the values of some of them that a coarse search tries, all with all."""
+
+    kind: str
+    parameters: tuple[Parameter, ...]
+    search: dict[str, tuple[float, ...]]
+
+    def scaled(self, density: float) -> Family:
+        """For a body of ``density`` [kg/m^3]: stresses and viscosities in proportion."""
+        share = density / 1000
+
+        def factor(name: str) -> float:
+            return share if UNITS[name].startswith("Pa") else 1.0
+
+        parameters = tuple(
+            dataclasses.replace(p, **{f: getattr(p, f) * factor(p.name) for f in ("start", "lower", "upper")})
+            for p in self.parameters
+        )
+        return Family(self.kind, parameters, {n: tuple(v * factor(n) for v in vs) for n, vs in self.search.items()})
+
+    def candidates(self) -> list[dict[str, float]]:
+        """The values that a coarse search tries."""
+        start = {p.name: p.start for p in self.parameters}
+        return [
+            {**start, **dict(zip(self.search, chosen, strict=True))}
+            for chosen in itertools.product(*self.search.values())
+        ]
+
+
+FAMILIES = {
+    family.kind: family
+    for family in (
+        Family("neo_hookean", (MODULUS, RATIO), {"youngs_modulus": (3e3, 1e4, 3e4, 1e5, 3e5)}),
+        Family(
+            "newtonian",
+            (
+                Parameter("viscosity", 30.0, 0.05, 1e4, 0.1, log=True),
+                Parameter("bulk_modulus", 2e5, 5e3, 3e6, 0.1, log=True),
+            ),
+            {"viscosity": (3.0, 30.0, 300.0), "bulk_modulus": (4e4, 3e5)},
+        ),
+        Family(
+            "von_mises",
+            (MODULUS, RATIO, YIELD),
+            {"youngs_modulus": (3e4, 1e5, 3e5), "yield_stress": (3e2, 1e3, 3e3, 1e4)},
+        ),
+        Family(
+            "non_newtonian",
+            (
+                Parameter("shear_modulus", 1e4, 3e2, 1e6, 0.05, log=True),
+                Parameter("bulk_modulus", 5e4, 3e3, 3e6, 0.1, log=True),
+                YIELD,
+                Parameter("plastic_viscosity", 20.0, 0.05, 1e4, 0.1, log=True),
+            ),
+            {"shear_modulus": (3e3, 1e4, 4e4), "yield_stress": (30.0, 200.0, 1e3), "plastic_viscosity": (5.0, 40.0)},
+        ),
+        Family(
+            "drucker_prager",
+            (MODULUS, RATIO, Parameter("friction_angle", 30.0, 1.0, 70.0, 1.0)),
+            {"youngs_modulus": (1e5, 5e5), "friction_angle": (15.0, 30.0, 45.0)},
+        ),
+    )
+}
+
+
+def initial_state_parameters(problem: Problem, motion: InitialState) -> tuple[Parameter, ...]:
+    """Velocity [m/s], spin [rad/s] and, where there is a ground, its offset [m], around ``motion``."""
+    parameters = []
+    for name, tensor, reach, step in (("velocity", motion.velocity, 3.0, 0.02), ("omega", motion.omega, 6.0, 0.05)):
+        for axis, value in zip("xyz", tensor.double().tolist(), strict=True):
+            parameters.append(Parameter(f"{name}_{axis}", value, value - reach, value + reach, step))
+    reach = problem.config.ground_range
+    if problem.scene.ground is not None and reach > 0:
+        start = float(np.clip(float(motion.ground_offset), -reach, reach))
+        parameters.append(Parameter("ground_offset", start, -reach, reach, 2e-3))
+    return tuple(parameters)
+
+
+def initial_state_from(values: dict[str, float]) -> InitialState:
+    """The throw among ``values``."""
+    return InitialState(
+        torch.tensor([values[f"velocity_{a}"] for a in "xyz"], dtype=torch.float32),
+        torch.tensor([values[f"omega_{a}"] for a in "xyz"], dtype=torch.float32),
+        torch.tensor(values.get("ground_offset", 0.0), dtype=torch.float32),
+    )
+
+
+def law_of(family: Family, values: dict[str, float]) -> ClassicalLaw:
+    """The law among ``values``."""
+    return ClassicalLaw(family.kind, **{p.name: values[p.name] for p in family.parameters})
+
+
+class Rollouts:
+    """Residuals of ``values`` (law and throw) over the first ``frames``: (K, N, 3) [m], simulated less observed.
+
+    All take the number of substeps that the first law needs, softer ones too: what a grid loses depends on it by
+    millimetres, and a jump would be mistaken for a derivative. A law too stiff for it is refused, as one that diverges.
+    """
+
+    STABLE = 1.4
+    """Substeps that a law may need over those taken: the configured Courant number leaves as much."""
+
+    def __init__(self, problem: Problem, family: Family, contact: str, frames: int) -> None:
+        self.problem = problem
+        self.family = family
+        self.contact = contact
+        self.frames = frames
+        self.steps = 0
+
+    @torch.no_grad()
+    def field(self, values: dict[str, float]) -> np.ndarray:
+        """Raises NonFiniteError where the rollout diverges, spreads without bound or is too stiff to be simulated."""
+        law = law_of(self.family, values)
+        try:
+            if self.steps == 0:
+                self.steps = self.problem.substeps(law)
+            needed = self.problem.least_substeps(law)
+            if needed > self.STABLE * self.steps:
+                raise NonFiniteError(0, 0, f"the law needs {needed} substeps a frame, {self.steps} are taken")
+            positions = self.problem.run(law, initial_state_from(values), self.contact, self.frames, steps=self.steps)
+        except (InputError, NonFiniteError):
+            raise
+        except MasivError as failed:
+            raise NonFiniteError(0, 0, str(failed)) from failed
+        return (positions - self.problem.targets[: len(positions)]).double().numpy()
+
+    def __call__(self, values: dict[str, float]) -> np.ndarray:
+        return self.field(values).ravel()
+
+
+def mean_distance(field: np.ndarray) -> float:
+    """Mean distance [m] of a residual field (K, N, 3)."""
+    return float(np.linalg.norm(field, axis=2).mean())

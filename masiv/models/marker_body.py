@@ -1,0 +1,236 @@
+"""A measured body in the simulator: particles, clamp, rest and release."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from masiv.effects.active import ActiveEffects
+from masiv.effects.effect import EffectContext
+from masiv.errors import InputError, MasivError
+from masiv.models.attachment import Attachment, attach
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.design import grid_spacing, substeps_per_frame
+from masiv.mpm.rollout import at_rest, rollout
+from masiv.mpm.simulator import Simulator, State
+from masiv.scene.transforms import SimulationFrame
+from masiv.tracks.geometry import Geometry
+from masiv.tracks.tracks import Run, Tracks
+
+if TYPE_CHECKING:
+    from masiv.materials.law import Law
+
+
+def fill_geometry(geometry: Geometry, spacing: float) -> np.ndarray:
+    """Particles (N, 3) [m, own axes] about ``spacing`` [m] apart: the middles of cells that divide the bounding box
+    evenly, where they are inside. Each stands for volume / N. Raises MasivError where fewer than 8 are."""
+    counts = np.maximum(np.rint((geometry.upper - geometry.lower) / spacing).astype(int), 1)
+    centres, inside = geometry.lattice_inside(counts)
+    if inside.sum() < 8:
+        raise MasivError(f"the body is thinner than the particle spacing {1e3 * spacing:.2g} mm: choose a smaller one")
+    return centres[inside]
+
+
+@dataclass(frozen=True)
+class SimulatedBody:
+    """A body of a run at rest, ready to be let go. particles (N, 3) float64 [m, simulation frame]; volume [m³];
+    density [kg/m³]; spacing of the grid [m]; frame: world -> simulation; gravity (3,) [m/s², simulation frame];
+    contact with the ground; normals (P, 3), heights (P,) [m, simulation frame] of the clamp (P = 0: none);
+    attachment: of ``markers``, the run's markers that move with the material (indices into ``run.markers``)."""
+
+    particles: torch.Tensor
+    volume: float
+    density: float
+    spacing: float
+    frame: SimulationFrame
+    gravity: np.ndarray
+    contact: str
+    normals: torch.Tensor
+    heights: torch.Tensor
+    attachment: Attachment
+    markers: tuple[int, ...]
+
+    @property
+    def mass(self) -> float:
+        """[kg]"""
+        return self.density * self.volume
+
+    @property
+    def size(self) -> float:
+        """Longest side [m] of the particles' bounding box."""
+        return float((self.particles.max(0).values - self.particles.min(0).values).max())
+
+    def released(self, dtype: torch.dtype = torch.float32, lift: float = 0.0) -> State:
+        """State at the release: at rest, stress-free if ``lift`` [m] is 0 (``masiv.models.cantilever_preload``)."""
+        from masiv.models.cantilever_preload import bent
+
+        x, gradient = bent(self, lift)
+        still = torch.zeros_like(x, dtype=dtype)
+        return replace(at_rest(x.to(dtype), still, torch.zeros_like(gradient, dtype=dtype)),
+                       trial_gradient=gradient.to(dtype).contiguous())  # fmt: skip
+
+    def effects(self, members: tuple = (), *, duration: float, frame_time: float) -> ActiveEffects:
+        """Effects with their parameters, and after them the clamp."""
+        from masiv.effects._clamp import clamped
+
+        x = self.particles
+        gravity = torch.as_tensor(self.gravity, dtype=x.dtype)
+        setting = EffectContext(gravity, x, self.mass / len(x), self.size, duration, frame_time)
+        active = ActiveEffects(tuple(members), setting)
+        return clamped(active, self.normals, self.heights) if len(self.heights) else active
+
+    def markers_to_world(self, positions: torch.Tensor) -> np.ndarray:
+        """Particles (T, N, 3) [m, simulation frame] -> markers (T, len(markers), 3) [m, world]."""
+        return self.frame.points_to_world(self.attachment.apply(positions.detach().double()).numpy())
+
+
+def simulated_body(
+    tracks: Tracks, run: Run, config: SimulatorConfig, *, particle_spacing: float, contact: str = "sticky"
+) -> SimulatedBody:
+    """The body of ``run`` filled with particles ``particle_spacing`` [m] apart, at its place in that run.
+
+    The grid holds ``config.particles_per_cell`` of them a cell. Without a ground it runs along the body's own axes, a
+    plane of its nodes in each face of the clamp's first plane, so that neither is blurred. Raises InputError where the
+    scene does not say what is needed.
+    """
+    body = tracks.bodies[run.body]
+    if body.geometry is None or body.density is None or run.placement is None:
+        raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass, to be simulated")
+    own = fill_geometry(body.geometry, particle_spacing)
+    spacing = grid_spacing(body.geometry.volume, len(own), config)
+    placement = run.placement
+    if tracks.ground is None:
+        frame = _along_body(placement.rotation, tracks.up)
+    else:
+        frame = SimulationFrame.from_scene(tracks.up, tracks.ground)
+    normals, heights = np.zeros((0, 3)), np.zeros(0)
+    if body.clamp is not None:
+        in_world = body.clamp.normals @ placement.rotation.T
+        heights = body.clamp.heights + in_world @ placement.translation
+        normals = frame.vectors_to_simulation(in_world)
+        heights = heights + normals @ frame.translation
+    if tracks.ground is None:
+        frame, heights = _on_nodes(frame, placement.to_world(own), normals, heights, spacing)
+    particles = frame.points_to_simulation(placement.to_world(own))
+    held = body.clamp.markers if body.clamp is not None else ()
+    free = tuple(m for m, name in enumerate(run.markers) if name not in held and np.isfinite(run.at_rest[m]).all())
+    if not free:
+        raise InputError(f"run {run.name}: no marker with all three axes moves with the material")
+    attachment = attach(particles, frame.points_to_simulation(run.at_rest[list(free)]), particle_spacing)
+    return SimulatedBody(
+        particles=torch.as_tensor(particles),
+        volume=body.geometry.volume,
+        density=body.density,
+        spacing=spacing,
+        frame=frame,
+        gravity=frame.vectors_to_simulation(tracks.gravity),
+        contact=contact if tracks.ground is not None else "none",
+        normals=torch.as_tensor(normals),
+        heights=torch.as_tensor(heights),
+        attachment=attachment,
+        markers=free,
+    )
+
+
+def _along_body(rotation: np.ndarray, up: np.ndarray) -> SimulationFrame:
+    """Axes along those of the body, the one nearest to ``up`` as y."""
+    to_own = rotation.T
+    best, nearest = np.eye(3), -math.inf
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            turn = np.diag(signs) @ np.eye(3)[list(order)] @ to_own
+            score = float((turn @ up)[1]) + 1e-3 * float(np.trace(turn))
+            if np.linalg.det(turn) > 0 and score > nearest:
+                best, nearest = turn, score
+    return SimulationFrame(best, np.zeros(3))
+
+
+def _on_nodes(
+    frame: SimulationFrame, world: np.ndarray, normals: np.ndarray, heights: np.ndarray, spacing: float
+) -> tuple[SimulationFrame, np.ndarray]:
+    """Shift ``frame`` so that nodes lie in the first plane of the clamp, and in the body's middle otherwise."""
+    points = frame.points_to_simulation(world)
+    shift = -0.5 * (points.max(0) + points.min(0))
+    if len(heights):
+        along = int(np.abs(normals[0]).argmax())
+        if abs(normals[0, along]) > 1 - 1e-6:
+            shift[along] = -heights[0] * np.sign(normals[0, along])
+    return SimulationFrame(frame.rotation, frame.translation + shift), heights + normals @ shift
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A rollout to the times of a run: ``steps`` substeps, of which ``outputs`` fall on the times to within half a
+    substep."""
+
+    simulator: Simulator
+    steps: int
+    outputs: list[int]
+
+
+def plan(
+    body: SimulatedBody,
+    law: Law,
+    times: np.ndarray,
+    config: SimulatorConfig,
+    *,
+    speed: float = 1.0,
+    dtype: torch.dtype = torch.float32,
+    substep: float | None = None,
+) -> Plan:
+    """How to simulate from the release to ``times`` (T,) [s since then, ascending], up to ``speed`` [m/s].
+
+    ``substep`` [s] takes the place of the one that ``config`` gives.
+    """
+    if times[0] < 0 or not times[-1] > 0:
+        raise InputError("a simulation runs from the release on: give times from 0 s, such as those of run.moving()")
+    last = float(times[-1])
+    if substep is None:
+        frame_time = last / max(len(times) - 1, 1)
+        count = substeps_per_frame(
+            spacing=body.spacing,
+            wave_modulus=law.wave_modulus(),
+            density=body.density,
+            speed=speed,
+            frame_time=frame_time,
+            config=config,
+        )
+        substep = frame_time / count
+    outputs = [round(float(t) / substep) for t in times]
+    simulator = Simulator(
+        particle_count=len(body.particles),
+        spacing=body.spacing,
+        substep=substep,
+        volume=body.volume,
+        density=body.density,
+        gravity=body.gravity,
+        contact=body.contact,
+        dtype=dtype,
+        memory_mb=config.memory_mb,
+        max_substeps=256,
+        grid_nodes=config.grid_nodes,
+        chunks=config.chunks,
+    )
+    return Plan(simulator, outputs[-1], outputs)
+
+
+def simulated_markers(
+    body: SimulatedBody, law: Law, times: np.ndarray, config: SimulatorConfig, members: tuple = (), **how
+) -> np.ndarray:
+    """Markers (T, len(body.markers), 3) [m, world] at ``times`` (T,) [s since the release], not differentiated.
+
+    members: effects with their parameters; how: see ``plan``.
+    """
+    planned = plan(body, law, times, config, **how)
+    duration = float(times[-1])
+    effects = body.effects(members, duration=duration, frame_time=duration / max(len(times) - 1, 1))
+    with torch.no_grad():
+        state = body.released(planned.simulator.dtype)
+        positions = rollout(planned.simulator, law, state, planned.steps, sorted(set(planned.outputs)), effects)
+    row = {step: k for k, step in enumerate(sorted(set(planned.outputs)))}
+    return body.markers_to_world(positions[[row[step] for step in planned.outputs]])

@@ -1,0 +1,1 @@
+"""What was observed, of pictures or of tracks, behind one interface."""

@@ -1,0 +1,1 @@
+"""Rollouts of a twin, as filmed or varied."""
