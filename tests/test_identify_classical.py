@@ -12,7 +12,7 @@ from masiv.identify import baseline
 from masiv.identify.classical_fit import FamilyFit, ranked
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.stage import identify
-from masiv.inference.correlation import effective_samples
+from masiv.inference.noise_model import effective_samples
 from masiv.materials.classical import ClassicalLaw
 from masiv.models import families
 from masiv.models.families import FAMILIES, law_of

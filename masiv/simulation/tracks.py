@@ -14,7 +14,7 @@ from masiv.errors import InputError
 from masiv.models.clamped_body import BodySimulation
 from masiv.models.point_mass import PointRun, PointSimulation
 from masiv.mpm.rollout import rollout
-from masiv.refine.tracks_stage import simulated
+from masiv.simulation.tracks_model import simulated
 from masiv.tracks.tracks import Tracks
 from masiv.tracks.twin import TracksTwin
 

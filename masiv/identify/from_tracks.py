@@ -1,0 +1,92 @@
+"""Identify the law of the bodies of a scene of tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from masiv import runtime
+from masiv.config import Config
+from masiv.errors import InputError, MasivError
+from masiv.identify.flights import fit_flights
+from masiv.identify.tracks import conditions, family_of, fit_law, only_body, ratio_of, simulation_of
+from masiv.inference.model_fit import ModelFit, rank_by_bic
+from masiv.models.families import FAMILIES
+from masiv.models.point_mass import PointSimulation, point_runs
+from masiv.progress import Progress, silent
+from masiv.tracks.tracks import Tracks
+from masiv.tracks.twin import RIGID_KIND, TracksTwin, law_parameters, starts_of
+
+AUTO = ("neo_hookean", "von_mises")
+"""Laws that compete if none is named."""
+
+
+def group_of(tracks: Tracks) -> str | None:
+    """The group in which the bodies of a scene fly; None if it is of one body. Raises InputError for several."""
+    if len(tracks.bodies) == 1 and next(iter(tracks.bodies.values())).clamp is not None:
+        return None
+    groups = tracks.groups()
+    if len(groups) == 1 and all(len(run.markers) == 1 for run in tracks.runs):
+        return next(iter(groups))
+    only_body(tracks)
+    return None
+
+
+def identify_tracks(
+    tracks: Tracks, config: Config, *, folder: Path | None = None, progress: Progress = silent
+) -> tuple[TracksTwin, list[ModelFit]]:
+    """The law that explains the runs of the first condition best, and the fits that competed, best first.
+
+    Raises InputError for a law that is not one of few parameters, MasivError if none explains the motion. folder: keeps
+    rollouts, so that a killed run goes on.
+    """
+    group = group_of(tracks)
+    with runtime.torch_threads(1):
+        if group is not None:
+            fitted = fit_flights(PointSimulation(tracks, point_runs(tracks, group)))
+            twin = TracksTwin(RIGID_KIND, {}, group, starts=starts_of(fitted), fit=errors_mm(fitted))
+            return twin, [fitted]
+        fits = _fit_laws(tracks, config, folder, progress)
+        best = fits[0]
+        known = _known(tracks, config, best.model.family.kind)
+        law = law_parameters(best, known)
+        twin = TracksTwin(best.model.family.kind, law, None, starts=starts_of(best), fit=errors_mm(best))
+        return twin, fits
+
+
+def _fit_laws(tracks: Tracks, config: Config, folder: Path | None, progress: Progress) -> list[ModelFit]:
+    """Fits of the laws that compete, best first."""
+    body, condition = only_body(tracks), conditions(tracks)[0]
+    fits: list[ModelFit] = []
+    failed = ""
+    for kind in _kinds(config.identify.law):
+        known = _known(tracks, config, kind)
+        forward_model = simulation_of(tracks, condition, config.tracks, config.simulator, known=known, folder=folder)
+        family = family_of(kind, body.density or 1e3, known)
+        try:
+            fits.append(fit_law(forward_model, family, config.tracks, progress))
+        except MasivError as error:
+            failed = str(error)
+            progress(f"identify: {kind}", 1, 1, failed)
+    if not fits:
+        raise MasivError(f"identify: no classical law explains the motion: {failed}")
+    return rank_by_bic(fits)
+
+
+def _known(tracks: Tracks, config: Config, kind: str) -> dict[str, float]:
+    """Poisson's ratio as the scene declares it, if the law ``kind`` has one."""
+    has_ratio = "poissons_ratio" in {p.name for p in FAMILIES[kind].parameters}
+    return ratio_of(only_body(tracks), config.tracks) if has_ratio else {}
+
+
+def _kinds(law: str) -> tuple[str, ...]:
+    if law in ("neural", "adapter"):
+        raise InputError(
+            f"--law {law} needs a motion of the whole body, and a few markers do not show it: use --law auto, or one "
+            f"of {', '.join(FAMILIES)}"
+        )
+    return AUTO if law == "auto" else (law,)
+
+
+def errors_mm(fitted: ModelFit) -> dict[str, float | None]:
+    """Root mean square distances of a fit, for twin.yaml."""
+    return {"fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}
