@@ -41,8 +41,9 @@ def evaluate(
     folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
     folder.require("trajectory")
     stages.start(settings)
+    from masiv.files import write_json
     from masiv.report.numbers import evaluation_numbers, table
-    from masiv.runfolder import load_motion, write_json
+    from masiv.runfolder import load_motion
     from masiv.twin import Twin
 
     dynamic, trajectory = stages.load_dynamic(folder), stages.load_trajectory(folder)

@@ -98,9 +98,9 @@ def identify(
         pictures=0 if no_silhouette else None,
     )
     stages.start(settings)
+    from masiv.files import write_json
     from masiv.report.numbers import material_numbers, run_numbers, table
     from masiv.report.report import write_report
-    from masiv.runfolder import write_json
     from masiv.simulation.simulate import simulate
 
     with progress_bar() as progress:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,8 +11,9 @@ import numpy as np
 import yaml
 
 from masiv.config import Config
+from masiv.files import write_json, write_npz, write_yaml
 from masiv.progress import Progress
-from masiv.runfolder import RunFolder, write_json
+from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
 
 from . import stages
@@ -164,16 +164,14 @@ def _save_fields(path: Path, found: Refined) -> None:
     """Residuals of the first throw (K, N, 3) [m, world], simulated less observed, where they are and when."""
     problem = found.simulation.observations[0].problem
     turn = problem.axes.vectors_to_world
-    temporary = path.with_suffix(".tmp.npz")
-    np.savez_compressed(
-        temporary,
+    write_npz(
+        path,
         before=turn(found.before[0]).astype(np.float32),
         after=turn(found.after[0]).astype(np.float32),
         positions=problem.axes.points_to_world(problem.start.double().numpy()).astype(np.float32),
         times=np.arange(1, len(found.before[0]) + 1) / (problem.samples * problem.scene.fps),
         fitted=found.simulation.observations[0].fit_count,
     )
-    os.replace(temporary, path)
 
 
 def _save_rollout(run: RunFolder, positions: np.ndarray, scene: Scene) -> None:
@@ -189,6 +187,4 @@ def _keep_old(run: Path) -> None:
     shutil.copyfile(run / "law.safetensors", run / LAW_BEFORE)
     document = yaml.safe_load((run / "twin.yaml").read_text(encoding="utf-8"))
     document["law"]["file"] = LAW_BEFORE
-    temporary = run / f"{BEFORE}.tmp"
-    temporary.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-    os.replace(temporary, run / BEFORE)
+    write_yaml(run / BEFORE, document)

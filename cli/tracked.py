@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from masiv import runtime
 from masiv.config import Config, load_config
 from masiv.errors import InputError
-from masiv.runfolder import Request, RunFolder, write_json
+from masiv.files import write_json
+from masiv.runfolder import Request, RunFolder
 from masiv.strict import read_yaml
 from masiv.tracks.read import read_tracks, recognises
 from masiv.tracks.summary import identity
@@ -207,7 +208,8 @@ def refine(
             twin = twin_after(twin, found)
             twin.save(run.path)
         report(run, config, tracks, twin, progress)
-    shutil.rmtree(_kept(run), ignore_errors=True)
+    if _kept(run).exists():
+        shutil.rmtree(_kept(run))
     lines = [text(named(written))]
     for body, row in written["bodies"].items():
         held = row["held_out_mm"]
