@@ -10,11 +10,11 @@ BIN = $(VENV)/bin
 INSTALLED = $(VENV)/installed
 RUN = runs/demo
 
-.PHONY: demo test lint bench clean install
+.PHONY: demo test lint wheel-test bench clean install
 
 install: $(INSTALLED)
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(INSTALLED): pyproject.toml setup.py constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --retries 1 --upgrade pip
 	$(BIN)/python -m pip install --quiet --retries 1 $(EXTRA_INDEX) -c constraints.txt --no-deps torch
@@ -33,6 +33,9 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+wheel-test: $(INSTALLED)
+	$(BIN)/python tests/wheel/check.py $(if $(TORCH_INDEX),--torch-index $(TORCH_INDEX))
 
 bench: $(INSTALLED)
 	for file in benchmarks/*.py; do $(BIN)/python $$file || exit 1; done

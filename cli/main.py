@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
 import typer
+
+import masiv
 
 from . import console
 from .evaluate import evaluate
@@ -27,6 +30,21 @@ app = typer.Typer(
 )
 for function in (identify, inspect, reconstruct, trajectory, refine, simulate, evaluate, pretrain, synth):
     app.command()(console.command(function))
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"masiv {masiv.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """The options of ``masiv`` itself, which stand before the command."""
 
 
 def run() -> None:

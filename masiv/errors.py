@@ -14,13 +14,19 @@ class InputError(MasivError):
 class NonFiniteError(MasivError):
     """A simulated particle became non-finite or moved faster than the grid allows.
 
-    Attributes: ``substep`` and ``particle`` are the indices where it was first seen.
+    Attributes: ``substep``, counted from the start of the simulation, and ``particle``, the indices where it was first
+    seen; ``detail``, what was seen.
     """
 
     def __init__(self, substep: int, particle: int, detail: str) -> None:
         super().__init__(
             f"simulation left the valid range at substep {substep}, particle {particle}: {detail}; "
-            "use more substeps (simulator.substep_safety) or a softer starting law"
+            "take shorter substeps (lower simulator.courant_number) or a softer starting law"
         )
         self.substep = substep
         self.particle = particle
+        self.detail = detail
+
+    def __reduce__(self) -> tuple[type[NonFiniteError], tuple[int, int, str]]:
+        """How it is copied and pickled: an exception's own way would give ``__init__`` the message alone."""
+        return type(self), (self.substep, self.particle, self.detail)

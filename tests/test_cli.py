@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from masiv import __version__
 from masiv.cli import main
 
-COMMANDS = ["identify", "inspect", "reconstruct", "trajectory", "simulate", "evaluate", "pretrain", "synth"]
+COMMANDS = [command.name or command.callback.__name__ for command in main.app.registered_commands]
 
 
 class Result:
@@ -72,6 +73,16 @@ def test_help_is_quick():
     assert result.returncode == 0
     assert all(name in result.stdout for name in COMMANDS)
     assert time.perf_counter() - began < 5
+
+
+def test_version(masiv):
+    result = masiv("--version")
+    assert (result.returncode, result.stdout) == (0, f"masiv {__version__}\n")
+
+
+def test_commands_are_those_of_the_application():
+    """The tests of each command have something to test."""
+    assert {"identify", "refine", "synth"} <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

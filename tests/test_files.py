@@ -69,7 +69,8 @@ def test_a_writer_that_fails_keeps_the_old_file(tmp_path):
 
 def test_the_temporary_name_is_in_the_same_folder_and_keeps_the_suffix(tmp_path):
     with atomic(tmp_path / "film.mp4") as temporary:
-        assert temporary.parent == tmp_path and temporary.suffix == ".mp4"
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".mp4"
         temporary.write_bytes(b"1")
         assert not (tmp_path / "film.mp4").exists()
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]

@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 
-from masiv.errors import InputError, MasivError
+from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.blend import BlendedLaw, blend
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
@@ -75,6 +75,15 @@ def test_a_force_is_cut_at_its_ends_and_not_at_frames():
     assert push.pieces(0.01, 0.03) == [(pytest.approx(0.02), True)]
     assert push.pieces(0.03, 0.05) == [(pytest.approx(0.02), False)]
     assert Push(np.ones(3), 0.01, 0.03 + 1e-12).pieces(0.03, 0.05) == [(pytest.approx(0.02), False)]
+
+
+def test_divergence_names_the_substep_from_the_start():
+    blow = Push(np.array([1e7, 0.0, 0.0]), start=2 / FPS)
+    flying = twin(gravity=np.zeros(3), ground=None, contact="none")
+    with pytest.raises(NonFiniteError) as caught:
+        simulate(flying, frames=6, substeps=10, push=blow)
+    assert 20 <= caught.value.substep < 30
+    assert f"substep {caught.value.substep}" in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -147,7 +147,7 @@ class _Evaluator:
             else:
                 raise MasivError(
                     f"the simulation diverges on both sides of {p.name} = {self.values(u)[p.name]:.4g}: "
-                    "use more substeps (simulator.substep_safety)"
+                    "take shorter substeps (lower simulator.courant_number)"
                 )
         self.jacobian_at = u.copy(), np.stack(columns, axis=1)
         return self.jacobian_at[1]

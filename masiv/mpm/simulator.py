@@ -138,7 +138,7 @@ class Simulator:
         if math.prod(shape) > self.k.capacity_nodes:
             raise MasivError(
                 f"the particles spread over {shape[0]} x {shape[1]} x {shape[2]} grid cells, more than the "
-                f"{self.k.capacity_nodes} reserved: raise simulator.grid_nodes or simulator.spacing_scale"
+                f"{self.k.capacity_nodes} reserved: raise simulator.grid_nodes or simulator.particles_per_cell"
             )
         return (*low, *shape)
 

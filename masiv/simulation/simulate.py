@@ -14,7 +14,7 @@ import torch
 
 from masiv import runtime
 from masiv.effects.active import ActiveEffects
-from masiv.errors import InputError
+from masiv.errors import InputError, NonFiniteError
 from masiv.files import write_npz
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import at_rest
@@ -175,6 +175,7 @@ def _timeline(
         effects = lowered(effects, raised[1])
     state = rigid_initial_state(start - raised, tensors["velocity"], tensors["omega"])
     yield replace(state, position=start), start
+    done = 0
     for interval in range(intervals):
         begin, elapsed, seen = interval / fps, 0.0, None
         pieces = [(1 / fps, False)] if push is None else push.pieces(begin, (interval + 1) / fps)
@@ -192,7 +193,11 @@ def _timeline(
             between = share < 1 and seen is None and place <= steps
             before = min(int(place), steps - 1)
             outputs = [before, before + 1] if between else []
-            recording = simulator.run(state, twin.law, steps, outputs, effects, begin + elapsed)
+            try:
+                recording = simulator.run(state, twin.law, steps, outputs, effects, begin + elapsed)
+            except NonFiniteError as error:  # whose substep is counted from ``state``
+                raise NonFiniteError(done + error.substep, error.particle, error.detail) from error
+            done += steps
             if between:  # between two substeps a particle moves in a straight line
                 early, after = recording.positions
                 seen = early + (place - before) * (after - early)

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from masiv.errors import InputError
+from masiv.mesh import read_mesh
 from masiv.synth.spec import ShapeSpec
 
 _FACETS_ALONG = 30
@@ -64,14 +64,7 @@ def _solids(spec: ShapeSpec) -> list[trimesh.Trimesh]:
             return [creation.torus(major_radius=0.34, minor_radius=0.16, major_sections=64, minor_sections=32)]
         case "cross":
             return [creation.box(np.where(np.arange(3) == axis, 1.0, 0.36)) for axis in range(3)]
-    if not spec.mesh.is_file():
-        raise InputError(f"shape.mesh {spec.mesh} does not exist: give the path of a mesh")
-    try:
-        mesh = trimesh.load(spec.mesh, force="mesh")
-    except (ValueError, OSError, KeyError, TypeError) as error:
-        raise InputError(f"{spec.mesh} is not a triangle mesh that can be read: {error}") from error
-    if len(mesh.faces) == 0 or not mesh.is_watertight:
-        raise InputError(f"{spec.mesh} is not watertight, so it has no inside: close its holes first")
+    mesh = read_mesh(spec.mesh)
     if mesh.volume < 0:
         mesh.invert()
     return [mesh]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from masiv.errors import InputError
+from masiv.mesh import read_mesh
 from masiv.tracks.declaration import METRES, GeometryDeclaration
 
 
@@ -76,12 +77,7 @@ def make_geometry(declared: GeometryDeclaration, folder: Path) -> Geometry:
     path = folder / declared.mesh
     if not path.is_file():
         raise InputError(f"{path} does not exist: correct geometry.mesh in scene.yaml")
-    try:
-        mesh = trimesh.load(path, force="mesh")
-    except Exception as error:  # its readers raise what they like
-        raise InputError(f"{path} is not a triangle mesh that can be read: {error}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not mesh.is_watertight:
-        raise InputError(f"{path} is not watertight, so it has no inside: close its holes first")
+    mesh = read_mesh(path)
     vertices = unit * np.array(mesh.vertices, np.float64)
     volume = abs(float(mesh.volume)) * unit**3
     return Geometry("mesh", vertices, np.array(mesh.faces), volume, vertices.min(0), vertices.max(0))
