@@ -59,7 +59,7 @@ class Material:
 
     def save(self, path: Path) -> None:
         """Write ``path`` (.json), complete or not at all."""
-        from masiv.runfolder import write_json
+        from masiv.files import write_json
 
         write_json(path, self.as_data())
 

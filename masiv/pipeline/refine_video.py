@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from masiv.files import write_json, write_npz, write_yaml
 from masiv.pipeline import stages
 from masiv.pipeline.requests import RefineRequest, Summary
 from masiv.progress import Progress
-from masiv.runfolder import RunFolder, load_motion, write_json
+from masiv.runfolder import RunFolder, load_motion
 from masiv.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -188,16 +188,14 @@ def _save_fields(path: Path, result: Refined) -> None:
     observation = result.simulation.observations[0]
     problem = observation.problem
     turn = problem.axes.vectors_to_world
-    temporary = path.with_suffix(".tmp.npz")
-    np.savez_compressed(
-        temporary,
+    write_npz(
+        path,
         before=turn(result.before[0]).astype(np.float32),
         after=turn(result.after[0]).astype(np.float32),
         positions=problem.axes.points_to_world(problem.start.double().numpy()).astype(np.float32),
         times=np.arange(1, len(result.before[0]) + 1) / (problem.samples * problem.scene.fps),
         fitted=observation.fit_count,
     )
-    os.replace(temporary, path)
 
 
 def _keep_identified_twin(run: Path) -> None:
@@ -207,6 +205,4 @@ def _keep_identified_twin(run: Path) -> None:
     shutil.copyfile(run / "law.safetensors", run / LAW_BEFORE)
     document = yaml.safe_load((run / "twin.yaml").read_text(encoding="utf-8"))
     document["law"]["file"] = LAW_BEFORE
-    temporary = run / f"{BEFORE}.tmp"
-    temporary.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-    os.replace(temporary, run / BEFORE)
+    write_yaml(run / BEFORE, document)
