@@ -214,7 +214,7 @@ def described(run: RunFolder, config: Config, twin: Twin) -> Iterator[None]:
 
 def describe(run: RunFolder, twin: Twin, progress: Progress = silent) -> None:
     """Write material.json: what the law of ``twin`` is in a tester's terms."""
-    from masiv.materials.describe import describe_twin
+    from masiv.characterization.describe import describe_twin
 
     if "refined" in twin.fit:  # what else is known of a fit is of the law before: the error is measured
         twin = replace(twin, fit={})
