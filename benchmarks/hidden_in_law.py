@@ -97,7 +97,7 @@ def gone_through(twin):
 
 def stresses(law):
     """Axial Kirchhoff stress [Pa] over strains up to STRAIN in tension and compression, a second there and back."""
-    from masiv.materials.curves import there_and_back, uniaxial
+    from masiv.characterization.curves import there_and_back, uniaxial
 
     return np.concatenate([uniaxial(law, there_and_back(s, 20), 0.025).stress for s in (STRAIN, -STRAIN)])
 

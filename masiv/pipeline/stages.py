@@ -182,7 +182,7 @@ def material_description(run: RunFolder, config: Config, twin: Twin) -> Iterator
 
 def describe_material(run: RunFolder, twin: Twin, progress: Progress = silent) -> None:
     """Write material.json: the law of ``twin`` in a tester's terms."""
-    from masiv.materials.describe import describe_twin
+    from masiv.characterization.describe import describe_twin
 
     if "refined" in twin.fit:  # the numbers of the fit are of the law before: the error is measured
         twin = replace(twin, fit={})

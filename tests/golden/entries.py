@@ -33,7 +33,7 @@ SAMPLE = {
     "refine": {
         "processes": 1, "particles": 200, "search_particles": 100, "families": 1, "laws": ["neo_hookean"],
         "effects": ["linear_drag", "body_force", "gravity_scale"], "baseline_rollouts": 6, "shortlist": 2,
-        "max_effects": 1, "second_look": False, "tracking_error": 0, "unexplained": 5, "least_gain": 0,
+        "max_effects": 1, "search_second_effect": False, "tracking_error": 0, "unexplained": 5, "least_gain": 0,
         "decisive_gain": 0, "simple_gain": 0, "decisive": 1, "plain_sigmas": 0, "least_bic": 0, "clear_bic": 0,
         "least_sigmas": 0,
     },
@@ -106,7 +106,7 @@ def track_case(name: str, settings: dict[str, Any], folder: Path) -> Numbers:
     from masiv.identify.config import IdentifyConfig
     from masiv.mpm.config import SimulatorConfig
     from masiv.refine.config import RefineConfig
-    from masiv.refine.observed import SampledMotion
+    from masiv.observations.motion import SampledMotion
     from masiv.refine.stage import Throw, refine
     from masiv.refine.summary import summary
 
@@ -117,7 +117,7 @@ def track_case(name: str, settings: dict[str, Any], folder: Path) -> Numbers:
     fitted = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
     run = Throw("0", scene, fitted, motion, case.fit_frames)
     found = refine([run], IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config)
-    after = found.outcome.after
+    after = found.result.after
     return {
         "observed": digest_of(motion.positions),
         **refined(summary(found, config, dry_run=False)),
