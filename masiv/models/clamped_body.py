@@ -8,7 +8,6 @@ are found from its own motion, and so are those of a run whose first moments are
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,10 +20,11 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.effect import DragBody, Effect, EffectContext, EffectParameter
 from masiv.errors import InputError, MasivError, NonFiniteError
+from masiv.files import write_npz
 from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, rms_mm
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.base import EffectTerm, WholeRunSplit
+from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit
 from masiv.models.cantilever_preload import across
 from masiv.models.free_body import Model
 from masiv.models.marker_body import Plan, SimulatedBody, plan, simulated_body
@@ -116,7 +116,7 @@ def body_run(
                    skip)  # fmt: skip
 
 
-class BodySimulation:
+class BodySimulation(SharedRollouts):
     """Runs of one body. known: values of law and effects that are not fitted; contact: with the ground."""
 
     def __init__(
@@ -141,7 +141,7 @@ class BodySimulation:
         self.ground = tracks.ground is not None
         self.across = np.concatenate([np.linalg.svd(tracks.up[None])[2][1:], tracks.up[None]])
         """Two horizontal axes and the vertical one (3, 3), world."""
-        self.rollouts = 0
+        super().__init__()
         self.substeps: dict[tuple[str, float], float] = {}
         self.kept: dict[tuple, CubicSpline] = {}
 
@@ -273,9 +273,7 @@ class BodySimulation:
         at = np.array(planned.outputs) * planned.simulator.substep
         markers = run.body.markers_to_world(positions)
         if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(file.with_suffix(".tmp.npz"), times=at, markers=markers, substep=planned.simulator.substep)
-            os.replace(file.with_suffix(".tmp.npz"), file)
+            write_npz(file, compressed=False, times=at, markers=markers, substep=planned.simulator.substep)
         spline = CubicSpline(at, markers)
         if len(self.kept) >= KEPT:
             self.kept.pop(next(iter(self.kept)))
