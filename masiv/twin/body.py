@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,9 +68,12 @@ class Release:
 
 @dataclass(frozen=True)
 class InitialCondition:
-    """How a body starts in one observation. velocity (3,) [m/s] of the centroid; omega (3,) [rad/s] about it; fps: frames
-    a second of the observation; condition: under which it was made, by which effects are chosen. placement: the body's
-    own axes -> world (None: they are the same). release: None for a body that flies freely."""
+    """How a body starts in one observation.
+
+    velocity (3,) [m/s] of the centroid; omega (3,) [rad/s] about it; fps: frames a second of the observation;
+    condition: under which it was made, which says what effects act. placement: the body's own axes -> world (None: they
+    are the same); of a rigid body, its place. release: None for a body that flies freely.
+    """
 
     observation: str
     body: str
@@ -83,8 +87,8 @@ class InitialCondition:
 
 @dataclass(frozen=True)
 class TwinEffect:
-    """An effect of ``masiv.effects.catalogue`` by name, with ``values`` of all its parameters, those of one body or those
-    that bodies can share, and their ``stderr`` (None: not known).
+    """An effect of ``masiv.effects.catalogue`` by name, with ``values`` of all its parameters and their ``stderr``
+    (None: not known). The parameters are those for one body, or those that bodies of different size and mass can share.
 
     bodies: names of those it acts on (none: all). condition: of the observations in which it acts (None: all).
     Vectors and places are in the simulation frame of the body: +y up, the ground at y = 0. place (3,) [m]: the same
@@ -126,3 +130,18 @@ class TwinEffect:
         bodies = not self.bodies or not other.bodies or bool(set(self.bodies) & set(other.bodies))
         return self.name == other.name and bodies and (None in (self.condition, other.condition)
                                                        or self.condition == other.condition)  # fmt: skip
+
+
+def with_start_values(start: InitialCondition, values: Mapping[str, float]) -> InitialCondition:
+    """``start`` of a point mass or of a body with markers with those of ``values`` that are named ``what@observation``
+    for it: ``position_x`` [m] and ``velocity_x`` [m/s] (y, z alike), or the offsets of a release."""
+    suffix = f"@{start.observation}"
+    own = {name.removesuffix(suffix): float(v) for name, v in values.items() if name.endswith(suffix)}
+    if not own:
+        return start
+    if start.release is not None:
+        return replace(start, release=replace(start.release, offsets=own))
+    place = start.placement or Placement(np.eye(3), np.zeros(3))
+    at = [own.get(f"position_{axis}", place.translation[k]) for k, axis in enumerate("xyz")]
+    velocity = [own.get(f"velocity_{axis}", start.velocity[k]) for k, axis in enumerate("xyz")]
+    return replace(start, placement=replace(place, translation=np.array(at)), velocity=np.array(velocity))

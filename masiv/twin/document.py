@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
 from masiv.errors import InputError
+from masiv.files import atomic, write_yaml
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
 from masiv.strict import read_yaml, validated
@@ -120,18 +119,15 @@ class PlacementPart(Part):
     error: Scalar[Literal["m"]]
 
 
-class OffsetsPart(Part):
-    release: Scalar[Literal["s"]] | None = None
-    aside_1: Scalar[Literal["m"]] | None = None
-    aside_2: Scalar[Literal["m"]] | None = None
-    above: Scalar[Literal["m"]] | None = None
-    lift: Scalar[Literal["m"]] | None = None
+class OffsetPart(Part):
+    value: float
+    unit: Literal["s", "m"]
 
 
 class ReleasePart(Part):
     markers: dict[str, Vector3[Literal["m"]]]
     max_speed: Scalar[Literal["m/s"]]
-    offsets: OffsetsPart
+    offsets: dict[str, OffsetPart]
 
 
 class InitialConditionPart(Part):
@@ -175,7 +171,8 @@ def write_document(twin: Mapping[str, Any], folder: Path, name: str = TWIN_FILE)
             tensors[body.name] = np.ascontiguousarray(body.particles)
         bodies.append(_body_entry(body, law_file, particles_file))
     if tensors:
-        _replace(folder / particles_file, lambda path: save_file(tensors, path))
+        with atomic(folder / particles_file) as temporary:
+            save_file(tensors, temporary)
     boundary: Boundary = twin["boundary"]
     ground = None
     if boundary.ground is not None:
@@ -191,14 +188,7 @@ def write_document(twin: Mapping[str, Any], folder: Path, name: str = TWIN_FILE)
         "simulator": twin["simulator"].model_dump(),
         "fit": twin["fit"],
     }
-    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
-    _replace(folder / name, lambda path: path.write_text(text, encoding="utf-8"))
-
-
-def _replace(path: Path, write: Callable[[Path], Any]) -> None:
-    temporary = path.with_name(f"{path.name}.tmp")
-    write(temporary)
-    os.replace(temporary, path)
+    write_yaml(folder / name, document)
 
 
 def _body_entry(body: Body, law_file: str, particles_file: str) -> dict[str, Any]:
@@ -240,11 +230,13 @@ def _initial_condition_entry(start: InitialCondition) -> dict[str, Any]:
             "error": _quantity(start.placement.error, "m"),
         }
     if start.release is not None:
-        units = {name: "s" if name == "release" else "m" for name in OffsetsPart.model_fields}
         release = {
             "markers": {name: _quantity(place, "m") for name, place in start.release.markers.items()},
             "max_speed": _quantity(start.release.max_speed, "m/s"),
-            "offsets": {name: _quantity(value, units[name]) for name, value in start.release.offsets.items()},
+            "offsets": {
+                name: _quantity(value, "s" if name == "release" else "m")
+                for name, value in start.release.offsets.items()
+            },
         }
     return {
         "observation": start.observation,
@@ -364,7 +356,7 @@ def _initial_condition(part: InitialConditionPart) -> InitialCondition:
         p = part.placement
         placement = Placement(np.array(p.rotation), np.array(p.translation.value), p.error.value)
     if part.release is not None:
-        offsets = {name: q.value for name, q in part.release.offsets if q is not None}
+        offsets = {name: offset.value for name, offset in part.release.offsets.items()}
         markers = {name: np.array(place.value) for name, place in part.release.markers.items()}
         release = Release(markers, part.release.max_speed.value, offsets)
     return InitialCondition(

@@ -32,7 +32,7 @@ def twin_of_tracks(tracks: Tracks, config: TracksConfig, simulator: SimulatorCon
     """rigid: each body is a point mass; otherwise it deforms, and its law is still None. Runs of the scene's first
     condition come first. Raises InputError for a body without geometry or mass, and for a run that cannot be used."""
     conditions = list(dict.fromkeys(run.condition for run in tracks.runs))
-    fitted = sorted((run for run in tracks.runs if run.purpose == "fit"), key=lambda run: conditions.index(run.condition))
+    fitted = [run for condition in conditions for run in tracks.chosen("fit", condition=condition)]
     bodies = tuple(_body(tracks, tracks.bodies[name], config, rigid) for name in dict.fromkeys(r.body for r in fitted))
     starts = tuple(_flight(run) if rigid else _release(tracks, run, config) for run in fitted)
     contact = "none" if tracks.ground is None or rigid else "sticky"
@@ -48,7 +48,8 @@ def twin_of_tracks(tracks: Tracks, config: TracksConfig, simulator: SimulatorCon
 
 def _body(tracks: Tracks, body: DeclaredBody, config: TracksConfig, rigid: bool) -> Body:
     drag = drag_body(tracks, body)
-    assert body.geometry is not None and body.density is not None  # drag_body raises otherwise
+    assert body.geometry is not None  # drag_body raises otherwise
+    assert body.density is not None
     volume = body.geometry.volume
     if rigid:
         return Body(body.name, volume, body.density, geometry=body.geometry.kind, drag=drag)
@@ -70,8 +71,7 @@ def _flight(run: Run) -> InitialCondition:
 
 def _release(tracks: Tracks, run: Run, config: TracksConfig) -> InitialCondition:
     free = tracks.bodies[run.body].free_markers(run)
-    observed, times = run.released(free, run.unsteady, config.duration)
-    speed = float(np.linalg.norm(np.diff(observed, axis=0), axis=2).max() / np.diff(times).min())
+    _, _, speed = run.released(free, run.unsteady, config.duration)
     markers = {run.markers[m]: run.at_rest[m] for m in free}
     return InitialCondition(
         run.name, run.body, run.rate, np.zeros(3), np.zeros(3), run.condition, run.placement, Release(markers, speed)

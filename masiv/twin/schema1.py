@@ -13,17 +13,14 @@ from masiv.errors import InputError
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
 from masiv.strict import validated
-from masiv.tracks.placement import Placement
-from masiv.twin.body import Body, Boundary, InitialCondition, Release, TwinEffect
+from masiv.twin.body import Body, Boundary, InitialCondition, TwinEffect, with_start_values
 from masiv.twin.document import EffectPart, check_names, read_effect, read_particles
 
 BODY, OBSERVATION = "body", "observation"
 """Names for what had none."""
 
 
-def read_schema1(
-    data: Mapping[str, Any], path: Path, scene: Callable[[], Mapping[str, Any]] | None
-) -> dict[str, Any]:
+def read_schema1(data: Mapping[str, Any], path: Path, scene: Callable[[], Mapping[str, Any]] | None) -> dict[str, Any]:
     """The fields of a ``Twin``. scene: see ``Twin.load``. Raises InputError."""
     try:
         if data.get("layout") != "tracks":
@@ -74,21 +71,10 @@ def _of_tracks(data: Mapping[str, Any], path: Path, scene: dict[str, Any]) -> di
         law = ClassicalLaw(kind, **{name: float(row["value"]) for name, row in rows.items()})
         law.stderr = {name: float(row["stderr"]) for name, row in rows.items() if row["stderr"] is not None}
         bodies = tuple(replace(body, law=law) for body in bodies)
-    starts = tuple(_with_start(start, data["starts"]) for start in scene["initial_conditions"])
+    values = {str(name): float(value) for name, value in data["starts"].items()}
+    starts = tuple(with_start_values(start, values) for start in scene["initial_conditions"])
     effects = _effects(data["effects"], path, bodies, starts)
     return {**scene, "bodies": bodies, "initial_conditions": starts, "effects": effects, "fit": data["fit"]}
-
-
-def _with_start(start: InitialCondition, values: Mapping[str, float]) -> InitialCondition:
-    """``start`` as ``values`` have it, named ``what@observation``."""
-    own = {n.removesuffix(f"@{start.observation}"): float(v) for n, v in values.items()
-           if n.endswith(f"@{start.observation}")}  # fmt: skip
-    if start.release is not None:
-        return replace(start, release=Release(start.release.markers, start.release.max_speed, own))
-    place = start.placement or Placement(np.eye(3), np.zeros(3))
-    at = [own.get(f"position_{a}", place.translation[k]) for k, a in enumerate("xyz")]
-    velocity = [own.get(f"velocity_{a}", start.velocity[k]) for k, a in enumerate("xyz")]
-    return replace(start, placement=replace(place, translation=np.array(at)), velocity=np.array(velocity))
 
 
 def _effects(

@@ -71,7 +71,8 @@ class Twin:
     def body(self) -> Body:
         """The only body. Raises InputError if there are several."""
         if len(self.bodies) != 1:
-            raise InputError(f"the twin has {len(self.bodies)} bodies ({', '.join(b.name for b in self.bodies)}), not one")
+            names = ", ".join(body.name for body in self.bodies)
+            raise InputError(f"the twin has {len(self.bodies)} bodies: {names}; this needs a twin of one")
         return self.bodies[0]
 
     @property
