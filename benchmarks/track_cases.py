@@ -23,7 +23,7 @@ from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
 from masiv.scene.scene import Ground, Scene
 from masiv.shapes import ShapeSpec, make_body
-from masiv.simulation.simulate import rigid_initial_state
+from masiv.simulation.free_body import rigid_initial_state
 
 FPS = 24.0
 

@@ -12,7 +12,7 @@ from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
-from masiv.simulation.simulate import rigid_initial_state
+from masiv.simulation.free_body import rigid_initial_state
 
 F64 = torch.float64
 DT, STEPS = 1e-3, 40

@@ -13,7 +13,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.simulation.simulate import rigid_initial_state
+from masiv.simulation.free_body import rigid_initial_state
 
 WEIGHTLESS = (0.0, 0.0, 0.0)
 G = 9.8

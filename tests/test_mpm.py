@@ -16,7 +16,7 @@ from masiv.mpm._reference import _substep
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulator import Simulator, State
 from masiv.pretraining.pretrain import pretrained_path
-from masiv.simulation.simulate import rigid_initial_state
+from masiv.simulation.free_body import rigid_initial_state
 
 pytestmark = pytest.mark.usefixtures("taichi")
 F64 = torch.float64

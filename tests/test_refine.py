@@ -26,7 +26,7 @@ from masiv.refine.config import RefineConfig
 from masiv.refine.stage import Throw, refine, split_frames
 from masiv.refine.summary import summary
 from masiv.scene.scene import Ground, Scene
-from masiv.simulation.simulate import rigid_initial_state
+from masiv.simulation.free_body import rigid_initial_state
 
 pytestmark = pytest.mark.usefixtures("taichi")
 FPS, FRAMES, FITTED = 24.0, 14, 10

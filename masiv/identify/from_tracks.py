@@ -13,8 +13,10 @@ from masiv.inference.model_fit import ModelFit, rank_by_bic
 from masiv.models.families import FAMILIES
 from masiv.models.point_mass import PointSimulation, point_runs
 from masiv.progress import Progress, silent
+from masiv.simulation.fitted_twin import fitted_twin
 from masiv.tracks.tracks import Tracks
-from masiv.tracks.twin import RIGID_KIND, TracksTwin, law_parameters, starts_of
+from masiv.twin import Twin
+from masiv.twin.from_tracks import twin_of_tracks
 
 AUTO = ("neo_hookean", "von_mises")
 """Laws that compete if none is named."""
@@ -33,24 +35,30 @@ def group_of(tracks: Tracks) -> str | None:
 
 def identify_tracks(
     tracks: Tracks, config: Config, *, folder: Path | None = None, progress: Progress = silent
-) -> tuple[TracksTwin, list[ModelFit]]:
+) -> tuple[Twin, list[ModelFit]]:
     """The law that explains the runs of the first condition best, and the fits that competed, best first.
 
     Raises InputError for a law that is not one of few parameters, MasivError if none explains the motion. folder: keeps
     rollouts, so that a killed run goes on.
     """
+    described = described_twin(tracks, config)
     group = group_of(tracks)
     with runtime.torch_threads(1):
         if group is not None:
-            fitted = fit_flights(PointSimulation(tracks, point_runs(tracks, group)))
-            twin = TracksTwin(RIGID_KIND, {}, group, starts=starts_of(fitted), fit=errors_mm(fitted))
-            return twin, [fitted]
+            forward_model = PointSimulation(tracks, point_runs(tracks, group))
+            fitted = fit_flights(forward_model)
+            return fitted_twin(described, fitted, forward_model, errors_mm(fitted)), [fitted]
         fits = _fit_laws(tracks, config, folder, progress)
         best = fits[0]
         known = _known(tracks, config, best.model.family.kind)
-        law = law_parameters(best, known)
-        twin = TracksTwin(best.model.family.kind, law, None, starts=starts_of(best), fit=errors_mm(best))
-        return twin, fits
+        condition = conditions(tracks)[0]
+        forward_model = simulation_of(tracks, condition, config.tracks, config.simulator, known=known, folder=folder)
+        return fitted_twin(described, best, forward_model, errors_mm(best)), fits
+
+
+def described_twin(tracks: Tracks, config: Config) -> Twin:
+    """What the scene says of its bodies and of how they start, without what is fitted. Raises InputError."""
+    return twin_of_tracks(tracks, config.tracks, config.simulator, rigid=group_of(tracks) is not None)
 
 
 def _fit_laws(tracks: Tracks, config: Config, folder: Path | None, progress: Progress) -> list[ModelFit]:

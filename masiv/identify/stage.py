@@ -69,14 +69,14 @@ def _identify(
         found = identify_classical(
             first.problem, coarse(), first.motion, first.first_frames, seed, checkpoint, progress
         )  # fmt: skip
-    return Twin(
+    return Twin.of_body(
+        observation=scene.path.resolve().name,
         positions=np.asarray(trajectory.positions[0], dtype=np.float32),
         velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
         omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
         gravity=np.asarray(scene.gravity, dtype=np.float64),
         ground=found.motion.ground(scene.ground),
         contact=found.contact,
-        friction=0.0,
         volume=trajectory.volume,
         density=scene.density,
         up=np.asarray(scene.up, dtype=np.float64),
@@ -118,12 +118,8 @@ def relearn(
     with runtime.torch_threads(1):
         throw = Throw(problem, motion, (problem.frames + 1) // 2)
         found = learn([throw], coarse, seed, checkpoint or Checkpoint(None), progress)
-    return replace(
-        twin,
-        velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
-        omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
-        ground=found.motion.ground(scene.ground),
-        contact=found.contact,
-        law=found.law,
-        fit={**twin.fit, **found.report, "trajectory_error_mm": 1e3 * found.error_m, "history": found.history},
-    )
+    velocity, omega = (axes.vectors_to_world(v.double().numpy()) for v in (found.motion.velocity, found.motion.omega))
+    learned = twin.with_body(law=found.law).with_motion(velocity=velocity, omega=omega)
+    learned = learned.with_boundary(ground=found.motion.ground(scene.ground), contact=found.contact)
+    errors = {"trajectory_error_mm": 1e3 * found.error_m, "history": found.history}
+    return replace(learned, fit={**twin.fit, **found.report, **errors})

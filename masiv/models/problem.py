@@ -23,7 +23,7 @@ from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.scene.scene import Ground, Scene
 from masiv.scene.transforms import SimulationFrame
-from masiv.simulation.simulate import rigid_initial_state
+from masiv.simulation.free_body import rigid_initial_state
 from masiv.twin import TwinEffect
 
 if TYPE_CHECKING:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from masiv import runtime
 from masiv.config import Config
 from masiv.errors import InputError
+from masiv.identify.from_tracks import group_of
 from masiv.identify.tracks import conditions, family_of, only_body, runs_of, simulation_of
-from masiv.inference.model_fit import ModelFit, gauss_newton_fit
-from masiv.models.clamped_body import BodySimulation
+from masiv.inference.model_fit import gauss_newton_fit
+from masiv.materials.classical import ClassicalLaw
 from masiv.models.free_body import Model
 from masiv.models.point_mass import PointSimulation, point_runs
 from masiv.progress import Progress, silent
@@ -21,8 +20,9 @@ from masiv.refine.pooling import refine_bodies
 from masiv.refine.result import RefineResult
 from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import check_effects, refine
+from masiv.simulation.fitted_twin import effect_values, law_values, place_of, start_values
 from masiv.tracks.tracks import Tracks
-from masiv.tracks.twin import TracksTwin
+from masiv.twin import Twin
 
 NOT_FOR_TRACKS = {
     "particles": "tracks.particles",
@@ -37,7 +37,7 @@ NOT_FOR_TRACKS = {
 
 
 def refine_tracks(
-    tracks: Tracks, twin: TracksTwin, config: Config, *, condition: str | None = None, dry_run: bool = False,
+    tracks: Tracks, twin: Twin, config: Config, *, condition: str | None = None, dry_run: bool = False,
     folder: Path | None = None, progress: Progress = silent,
 ) -> RefineResult:  # fmt: skip
     """Which effects does the model of the runs lack? Runs with ``use: hold_out`` judge them.
@@ -51,11 +51,12 @@ def refine_tracks(
     check_config(config)
     settings = SearchSettings.of(config.refine, rank_only=dry_run, progress=progress)
     with runtime.torch_threads(1):
-        if twin.group is None:
+        group = group_of(tracks)
+        if group is None:
             return _refine_body(tracks, twin, config, settings, condition, folder)
         if condition is not None:
             raise InputError("--condition is for runs of one body: bodies in flight are refined together")
-        return refine_group(tracks, twin.group, settings)
+        return refine_group(tracks, group, settings)
 
 
 def check_config(config: Config) -> None:
@@ -81,39 +82,29 @@ def refine_group(tracks: Tracks, group: str, settings: SearchSettings) -> Refine
 
 
 def _refine_body(
-    tracks: Tracks, twin: TracksTwin, config: Config, settings: SearchSettings, condition: str | None,
+    tracks: Tracks, twin: Twin, config: Config, settings: SearchSettings, condition: str | None,
     folder: Path | None,
 ) -> RefineResult:  # fmt: skip
     first = conditions(tracks)[0]
     condition = first if condition is None else condition
     if not any(run.purpose == "hold_out" for run in runs_of(tracks, condition)):
         raise InputError(f"{tracks.path}: no run to judge by: give one of its runs `use: hold_out`")
-    law = twin.law_values()
+    law = law_values(twin)
     effects: tuple[str, ...] = ()
     if condition == first:
-        known = {n: v for n, v in law.items() if twin.parameters[n][2] is None}
+        assert isinstance(twin.law, ClassicalLaw)
+        known = {n: v for n, v in law.items() if n not in twin.law.stderr}
     else:
-        acting = [e for e in twin.of(condition) if e.condition is None]
-        effects = tuple(e.effect for e in acting)
-        known = {**law, **{f"{e.effect}.{n}": v for e in acting for n, (v, _, _) in e.parameters.items()}}
+        acting = [e for e in twin.effects if e.condition is None]
+        effects = tuple(e.name for e in acting)
+        known = {**law, **{n: v for e in acting for n, v in effect_values(e, e.name).items()}}
     forward_model = simulation_of(tracks, condition, config.tracks, config.simulator, known=known, folder=folder)
-    family = family_of(twin.law, only_body(tracks).density or 1e3, known)
+    family = family_of(twin.law.kind, only_body(tracks).density or 1e3, known)
     model = Model(family, "sticky" if forward_model.ground else "none", effects)
     settings.progress("refine: without effects", 0, 1)
-    base = gauss_newton_fit(forward_model, model, {**law, **twin.starts}, budget=config.tracks.rollouts)
+    base = gauss_newton_fit(forward_model, model, {**law, **start_values(twin)}, budget=config.tracks.rollouts)
     settings.progress("refine: without effects", 1, 1, f"{base.fit_mm:.2f} mm")
     # A smooth force for the rest would need as many rollouts as all effects together.
     result = refine(forward_model, [base], replace(settings, discrepancy_force=False), condition=condition)
-    places = {t.name: place_in_body(forward_model, t.name, result.after) for t in result.accepted}
+    places = {t.name: place_of(forward_model, t.name, result.after) for t in result.accepted}
     return replace(result, places={name: place for name, place in places.items() if place is not None})
-
-
-def place_in_body(forward_model: BodySimulation, name: str, fitted: ModelFit) -> tuple[float, float, float] | None:
-    """The place of an effect in the body's own axes [m]; None if it has no place."""
-    values = [fitted.values.get(f"{name}.{axis}") for axis in "xyz"]
-    run = forward_model.observations[0]
-    placement = next(r for r in forward_model.tracks.runs if r.name == run.name).placement
-    if placement is None or any(v is None for v in values):
-        return None
-    own = placement.to_own(run.body.frame.points_to_world(np.array(values, dtype=float)))
-    return float(own[0]), float(own[1]), float(own[2])
