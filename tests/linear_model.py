@@ -74,8 +74,8 @@ EFFECTS = {
 class LinearModel(SharedRollouts):
     """A velocity along z, and effects that move the points by strength times pattern.
 
-    truth: strengths that are there; exclusive: of two of these a model has one at most; diverges: effects that cannot be
-    simulated. grid: strength of a pattern that finer grids change, twice as much on the second.
+    truth: strengths that are there; exclusive: of two of these a model has one at most; diverges: effects that cannot
+    be simulated. grid: strength of a pattern that finer grids change, twice as much on the second.
     """
 
     def __init__(self, truth, *, seed=0, exclusive=(), diverges=(), noise=NOISE, name="a", effects=EFFECTS):

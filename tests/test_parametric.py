@@ -139,9 +139,7 @@ def test_robust_fit_ignores_wild_residuals():
     noise[::20] += 5.0
     parameter = [Parameter("slope", 1.0, 0.0, 10, 0.01)]
     plain = gauss_newton(lambda v: v["slope"] * TIMES - 2 * TIMES - noise, parameter, max_evaluations=100)
-    robust = gauss_newton(
-        lambda v: v["slope"] * TIMES - 2 * TIMES - noise, parameter, max_evaluations=100, robust=True
-    )
+    robust = gauss_newton(lambda v: v["slope"] * TIMES - 2 * TIMES - noise, parameter, max_evaluations=100, robust=True)
     assert abs(robust.values["slope"] - 2) < 0.5 * abs(plain.values["slope"] - 2)
     assert robust.stderr(200)["slope"] < plain.stderr(200)["slope"]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
+from masiv.files import write_npz
 from masiv.inference.model_fit import ModelFit, rms_mm, split_fields
 from masiv.models.base import EffectTerm
 from masiv.models.free_body import GRID_CHANGE
@@ -209,6 +209,7 @@ def _unexplained(result: RefineResult) -> dict[str, Any]:
         "worst_observation": observation.name,
         "worst_time_s": float(observation.times[instant]),
         "worst_instant_rmse_mm": float(by_instant[k][instant]),
+        "worst_distance_mm": 1e3 * max(float(np.linalg.norm(f, axis=2).max()) for f in result.after.fields),
         "worst_place_at_start_m": place.tolist(),
         "worst_place_rmse_mm": 1e3 * float(np.sqrt(by_point[weight > 0].mean())) if weight.any() else 0.0,
         "rmse_mm_by_instant": {e.name: v.tolist() for e, v in zip(result.observations, by_instant, strict=True)},
@@ -272,10 +273,8 @@ def arrays(result: RefineResult) -> dict[str, np.ndarray]:
 
 
 def save_arrays(path: Path, result: RefineResult) -> None:
-    """Write ``arrays`` to a temporary name, then rename it."""
-    temporary = path.with_suffix(".tmp.npz")
-    np.savez_compressed(temporary, **arrays(result))  # type: ignore[arg-type]
-    os.replace(temporary, path)
+    """Write ``arrays``, completely or not at all."""
+    write_npz(path, **arrays(result))
 
 
 # -- for people ------------------------------------------------------------------------------------------------------
