@@ -196,8 +196,11 @@ class ForwardModel(Protocol):
     """Residuals of models over experiments, and the parameters of a model."""
 
     rollouts: int
-    observations: Sequence[Any]
-    """Of ``Observation``."""
+
+    @property
+    def observations(self) -> Sequence[Any]:
+        """Of ``Observation``."""
+        ...
 
     def with_observations(self: Self, observations: Sequence[Any]) -> Self:
         """A copy that compares with ``observations`` (the same, with another noise model or grid changes). It shares
