@@ -23,8 +23,7 @@ from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
 from masiv.scene.scene import Ground, Scene
-from masiv.synth.shapes import make_body
-from masiv.synth.spec import ShapeSpec
+from masiv.shapes import ShapeSpec, make_body
 
 FPS = 24.0
 

@@ -208,11 +208,11 @@ def fit_all_particles(
     parameters = _parameters(coarse, family, found)
     progress(label, 0, total)
     on_few = Misfit(coarse, family, found.contact, coarse.frames, pictures=pictures)
-    before = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
+    chord = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
     progress(label, 1, total)
     misfit = Misfit(problem, family, found.contact, problem.frames, pictures=pictures, chosen=coarse.chosen)
-    softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(before.residual))), 1e-12)
-    values, jacobian, scale = found.values, before.jacobian, 1.0
+    softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(chord.residual))), 1e-12)
+    values, jacobian, scale = found.values, chord.jacobian, 1.0
     best, residual = misfit(values)
     progress(label, 2, total, f"{1e3 * mean_distance(best):.1f} mm")
     for step in range(CHORD_STEPS):
@@ -221,19 +221,19 @@ def fit_all_particles(
         moved = _moved(parameters, values, scale * full)
         try:
             paths, tried = misfit(moved)
-            cost, least = (robust_cost(r, softness) for r in (tried, residual))
+            cost, before = (robust_cost(r, softness) for r in (tried, residual))
         except NonFiniteError:
-            cost, least = math.inf, 1.0
-        if cost < least:
+            cost, before = math.inf, 1.0
+        if cost < before:
             values, residual, best = moved, tried, paths
-            if cost > (1 - LEAST_GAIN) * least:
+            if cost > (1 - LEAST_GAIN) * before:
                 break
         else:
             scale *= 0.5
         progress(label, 3 + step, total, f"{1e3 * mean_distance(best):.1f} mm")
     weight = robust_weight(residual, softness)
     spread = covariance(jacobian * weight[:, None], residual * weight)
-    estimate = Estimate(values, spread, jacobian, residual, before.evaluations + CHORD_STEPS + 1, tuple(parameters))
+    estimate = Estimate(values, spread, jacobian, residual, chord.evaluations + CHORD_STEPS + 1, tuple(parameters))
     found = _updated(coarse, found, _of_paths(estimate, misfit), 4)
     found.error_m = mean_distance(best)
     keep(checkpoint, found, f"{found.kind}, {ALL}")

@@ -8,7 +8,6 @@ are found from its own motion, and so are those of a run whose first moments are
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.effect import DragBody, Effect, EffectContext, EffectParameter
 from masiv.errors import InputError, MasivError, NonFiniteError
+from masiv.files import write_npz
 from masiv.inference.model_fit import ModelFit, rms_mm
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit
@@ -284,9 +284,7 @@ class BodySimulation(SharedRollouts):
         at = np.array(planned.outputs) * planned.simulator.substep
         markers = run.body.markers_to_world(positions)
         if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(file.with_suffix(".tmp.npz"), times=at, markers=markers, substep=planned.simulator.substep)
-            os.replace(file.with_suffix(".tmp.npz"), file)
+            write_npz(file, compressed=False, times=at, markers=markers, substep=planned.simulator.substep)
         spline = CubicSpline(at, markers)
         if len(self.kept) >= KEPT:
             self.kept.pop(next(iter(self.kept)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ import torch
 from masiv import runtime
 from masiv.effects.active import ActiveEffects
 from masiv.errors import InputError, NonFiniteError
+from masiv.files import write_npz
 from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.simulator import Simulator, State
@@ -38,9 +38,7 @@ class Rollout:
 
     def save(self, path: Path) -> None:
         """Write ``path`` (.npz), complete or not at all."""
-        temporary = path.with_suffix(".tmp.npz")
-        np.savez_compressed(temporary, positions=self.positions, times=self.times)
-        os.replace(temporary, path)
+        write_npz(path, positions=self.positions, times=self.times)
 
 
 @dataclass(frozen=True)
