@@ -106,8 +106,8 @@ def track_case(name: str, settings: dict[str, Any], folder: Path) -> Numbers:
     from masiv import runtime
     from masiv.identify.config import IdentifyConfig
     from masiv.mpm.config import SimulatorConfig
-    from masiv.refine.config import RefineConfig
     from masiv.observations.motion import SampledMotion
+    from masiv.refine.config import RefineConfig
     from masiv.refine.stage import Throw, refine
     from masiv.refine.summary import summary
 
