@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from masiv.errors import NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.models.base import EffectTerm, SharedRollouts, WeightedResidual
 from masiv.models.families import Family
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 
 INSTANTS, FITTED, COUNT = 40, 30, 30
 TIMES = np.linspace(0.0, 1.0, INSTANTS)

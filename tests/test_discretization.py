@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from masiv.inference.discretization import with_grid_errors, with_residual_std
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit
 from masiv.models.base import SharedRollouts, WeightedResidual
+from masiv.models.parameters import Parameter
 
 INSTANTS, ROWS, POINTS = 6, 4, 5
 NOISE = 1e-3

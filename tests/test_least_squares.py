@@ -9,15 +9,9 @@ import numpy as np
 import pytest
 
 from masiv.errors import MasivError, NonFiniteError
-from masiv.inference.least_squares import (
-    Parameter,
-    broyden,
-    derivative,
-    gauss_newton,
-    gauss_newton_jump,
-    linearize,
-)
+from masiv.inference.least_squares import broyden, derivative, gauss_newton, gauss_newton_jump, linearize
 from masiv.inference.robust import soft_l1_mean_square, soft_l1_sum
+from masiv.models.parameters import Parameter
 
 TIMES = np.linspace(0, 2, 200)
 

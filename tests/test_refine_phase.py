@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.inference.robust import soft_l1_mean_square
 from masiv.models.base import EffectTerm, WeightedResidual
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 from masiv.refine.candidates import score
 from masiv.refine.effect_fit import fit_with_effect
 

@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 
 from masiv.errors import MasivError, NonFiniteError
 from masiv.inference.robust import NORMAL_MAD, soft_l1_mean_square, soft_l1_sum, soft_l1_weight
+from masiv.models.parameters import Parameter
 
 Residual = Callable[[dict[str, float]], np.ndarray]
 """Values by name -> residual (M,). Raises NonFiniteError if the simulation diverges."""
@@ -31,33 +32,6 @@ FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-6, 1e6
 """Levenberg-Marquardt damping over the diagonal of the normal equations."""
 MAX_LOG_JUMP = 0.7
 """Longest step of ``gauss_newton_jump`` in the logarithm of a parameter."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A number to fit. start, lower and upper in its own unit; ``step`` of the finite difference in the fitted scale,
-    which is the natural logarithm if ``log``: step 0.05 is then 5 %."""
-
-    name: str
-    start: float
-    lower: float
-    upper: float
-    step: float
-    log: bool = False
-
-    def __post_init__(self) -> None:
-        if not self.lower <= self.start <= self.upper or self.lower >= self.upper:
-            raise ValueError(f"parameter {self.name}: start {self.start} is not within [{self.lower}, {self.upper}]")
-        if self.step <= 0 or (self.log and self.lower <= 0):
-            raise ValueError(f"parameter {self.name}: needs a positive step, and a positive lower bound if log")
-
-    def fitted(self, value: float) -> float:
-        """The fitted scale of a value."""
-        return math.log(value) if self.log else value
-
-    def value(self, fitted: float) -> float:
-        """The value of a number in the fitted scale, never outside of the bounds by rounding."""
-        return float(np.clip(math.exp(fitted) if self.log else fitted, self.lower, self.upper))
 
 
 def with_start_values(parameters: Sequence[Parameter], values: Mapping[str, float]) -> tuple[Parameter, ...]:

@@ -13,7 +13,6 @@ from masiv.errors import NonFiniteError
 from masiv.inference.least_squares import (
     MIN_DECREASE,
     Linearization,
-    Parameter,
     Residual,
     broyden,
     covariance,
@@ -27,6 +26,7 @@ from masiv.inference.noise_model import NoiseModel
 from masiv.inference.robust import robust_scale_of, soft_l1_mean_square, soft_l1_weight
 from masiv.models.base import ForwardModel, Observation
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 
 STRENGTH_FACTORS = (0.25, 1.0, 4.0)
 """Factors of a strength that the linear model promised, which are tried if it misled."""

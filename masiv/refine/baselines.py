@@ -13,7 +13,8 @@ from masiv.inference.model_fit import ModelFit, evaluate_fit, gauss_newton_fit, 
 from masiv.inference.robust import robust_scale_of
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import Model, Simulation
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
 from masiv.refine.search import fits_of

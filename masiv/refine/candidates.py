@@ -13,11 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from masiv.errors import NonFiniteError
-from masiv.inference.least_squares import Parameter, free_parameters
+from masiv.inference.least_squares import free_parameters
 from masiv.inference.model_fit import ModelFit
 from masiv.inference.robust import soft_l1_mean_square, soft_l1_weight
 from masiv.inference.smooth_noise import basis_of
 from masiv.models.base import EffectTerm, ForwardModel
+from masiv.models.parameters import Parameter
 
 EXPLAINED_TIE_TOL = 0.02
 """Difference of explained shares below which two guesses explain the same."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from masiv.errors import NonFiniteError
-from masiv.inference.least_squares import Linearization, Parameter, broyden, derivative, gauss_newton_jump
+from masiv.inference.least_squares import Linearization, broyden, derivative, gauss_newton_jump
 from masiv.inference.model_fit import (
     ModelFit,
     best_strength,
@@ -20,6 +20,7 @@ from masiv.inference.model_fit import (
 )
 from masiv.inference.robust import soft_l1_mean_square
 from masiv.models.base import EffectTerm, ForwardModel
+from masiv.models.parameters import Parameter
 from masiv.refine.candidates import Candidate
 
 BROYDEN_STEPS = 8
