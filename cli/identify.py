@@ -44,12 +44,12 @@ def identify(
         typer.Option(
             "--geometry-loss",
             help="What a neural law is fitted to: trajectory (paths of particles, then surfaces; paths alone with "
-            "identify.polish: false), continuum (bodies frame by frame), surface, or none (pictures alone). "
+            "identify.surface_finetune: false), continuum (bodies frame by frame), surface, or none (pictures alone). "
             "[default: trajectory]",
         ),
     ] = None,
     no_silhouette: Annotated[
-        bool, typer.Option("--no-silhouette", help="Fit a neural law without silhouettes and paint: to geometry alone.")
+        bool, typer.Option("--no-silhouette", help="Fit a neural law without silhouettes and colors: to geometry alone.")
     ] = False,
     fit_frames: FitFramesOption = None,
     holdout: HoldoutOption = None,
@@ -137,7 +137,7 @@ def _law_text(described: dict[str, Any], families: list[dict[str, Any]]) -> str:
         if "failed" in row:
             lines.append(f"         {row['law']}: failed, {row['failed']}")
         else:
-            seen = row["picture_error"]
-            nearness = f"BIC {row['bic_above_best']:.0f} above the best" if seen is None else f"pictures {seen:.3f}"
+            loss = row["image_loss"]
+            nearness = f"BIC {row['bic_above_best']:.0f} above the best" if loss is None else f"image loss {loss:.3f}"
             lines.append(f"         {row['law']}: {row['trajectory_error_mm']:.1f} mm from the paths, {nearness}")
     return "\n".join(lines) + "\n"

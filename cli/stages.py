@@ -51,7 +51,7 @@ def open_run(
     settings = load_config(preset, config, existing.config if existing else None, **flags)
     scene = read_scene(scene_path)
     for other in settings.identify.also:
-        settings.identify.refuse_more_throws()
+        settings.identify.require_neural_for_several()
         if Path(other).resolve() == out.resolve():
             raise InputError(f"--also {other} is the run itself: give those of other throws of the same object")
         RunFolder.open(Path(other)).require("trajectory")
