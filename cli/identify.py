@@ -49,7 +49,7 @@ def identify(
         ),
     ] = None,
     no_silhouette: Annotated[
-        bool, typer.Option("--no-silhouette", help="Fit a neural law without silhouettes and colors: to geometry alone.")
+        bool, typer.Option("--no-silhouette", help="Fit a neural law to geometry alone, without the pictures.")
     ] = False,
     fit_frames: FitFramesOption = None,
     holdout: HoldoutOption = None,

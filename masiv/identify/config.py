@@ -8,7 +8,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from masiv.errors import InputError
 
-
 RENAMED_STARTS = {"honey": "maxwell_fluid"}
 """Starting laws of older versions (run.yaml, twin.yaml) and their names today."""
 
