@@ -12,8 +12,8 @@ from masiv.identify.classical.fit import fit_all_particles, fit_family, fit_furt
 from masiv.identify.classical.residuals import JointResidual
 from masiv.identify.classical.search import search_family
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.families import FAMILIES, initial_state_parameters
-from masiv.models.problem import InitialState
+from masiv.models.families import FAMILIES
+from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.progress import silent
 
 TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
@@ -22,7 +22,7 @@ DRIFT = np.array([0.25, 0.0, 0.0])
 
 
 def values_of(problem, **changes):
-    start = initial_state_parameters(problem, InitialState.of_world(problem.axes, VELOCITY, OMEGA))
+    start = initial_state_parameters(InitialState.of_world(problem.axes, VELOCITY, OMEGA), problem.ground_range)
     return {**TRUE, **{p.name: p.start for p in start}, **changes}
 
 

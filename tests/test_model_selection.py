@@ -10,8 +10,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.identify.classical import shortlist
 from masiv.identify.classical.fit import FURTHER, FamilyFit
 from masiv.identify.classical.model_selection import image_losses, rank_by_image_loss
-from masiv.models.families import initial_state_parameters
-from masiv.models.problem import InitialState
+from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.workers import Workers
 
 TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
@@ -20,7 +19,7 @@ WRONG = {"viscosity": 40.0, "bulk_modulus": 1e5}
 
 def fitted(objective, kind, values, mean_square):
     problem = objective.problem
-    start = initial_state_parameters(problem, InitialState.of_world(problem.axes, VELOCITY, OMEGA))
+    start = initial_state_parameters(InitialState.of_world(problem.axes, VELOCITY, OMEGA), problem.ground_range)
     every = {**values, **{p.name: p.start for p in start}}
     return FamilyFit(kind, "sticky", every, mean_square=mean_square, samples=100)
 

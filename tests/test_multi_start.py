@@ -11,7 +11,8 @@ from masiv.identify.neural.starting_law import StartingLaw
 from masiv.identify.neural.training import TrainingResult
 from masiv.identify.recording import FitRecording
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import silent
 

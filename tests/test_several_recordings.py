@@ -21,8 +21,8 @@ from test_identify import (  # noqa: F401  (fixtures)
     settings,
 )
 
-from cli.main import run
 from masiv.checkpoint import Checkpoint
+from masiv.cli.main import run
 from masiv.errors import InputError
 from masiv.identify.neural.training import train
 from masiv.identify.neural.training_state import TrainingState
@@ -30,8 +30,8 @@ from masiv.identify.recording import prepare_recording
 from masiv.identify.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
-from masiv.materials.pretrain import pretrained_path
 from masiv.mpm.config import SimulatorConfig
+from masiv.pretraining.pretrain import pretrained_path
 from masiv.simulation.simulate import simulate
 from masiv.twin import Twin
 

@@ -17,9 +17,10 @@ from masiv.identify.neural.training import TrainingResult
 from masiv.identify.recording import FitRecording
 from masiv.identify.stage import identify
 from masiv.materials.load import load_law
-from masiv.materials.pretrain import pretrained_path
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
+from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Frame
 from masiv.splat.rasteriser import render
 

@@ -22,8 +22,9 @@ from masiv.identify.losses.objective import Objective
 from masiv.identify.neural.starting_law import choose_starting_laws, search_cost
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import Model, Simulation, parameters
+from masiv.models.initial_state import InitialState
 from masiv.models.prepare import video_observation
-from masiv.models.problem import InitialState, Problem
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import DONE, baselines, derived

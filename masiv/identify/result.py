@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from masiv.materials.law import Law
-from masiv.models.problem import InitialState
+from masiv.models.initial_state import InitialState
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from masiv.identify.losses.objective import Objective
 from masiv.identify.neural.multi_start import fit_neural_law
 from masiv.identify.recording import FitRecording, prepare_recording
 from masiv.identify.result import IdentificationResult
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene

@@ -14,9 +14,9 @@ import yaml
 from masiv.errors import InputError
 from masiv.progress import Progress, silent
 from masiv.scene.camera import Camera
+from masiv.shapes import make_body
 from masiv.synth.motion import Skin, simulate
 from masiv.synth.picture import Surface, background, enlarged, picture
-from masiv.synth.shapes import make_body
 from masiv.synth.spec import CameraSpec, SynthSpec
 
 _SMALL = [cv2.IMWRITE_PNG_COMPRESSION, 9]
@@ -31,7 +31,8 @@ def synthesise(spec: SynthSpec, out: Path, *, progress: Progress = silent) -> No
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} holds something already: give --out a new folder")
     draft = out.with_name(out.name + ".tmp")
-    shutil.rmtree(draft, ignore_errors=True)
+    if draft.exists():
+        shutil.rmtree(draft)
     (draft / "data").mkdir(parents=True)
     (draft / "gt").mkdir()
     progress("simulate", 0, 1)

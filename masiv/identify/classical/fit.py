@@ -20,25 +20,12 @@ from masiv.identify.classical.residuals import JointResidual
 from masiv.identify.classical.search import search_family
 from masiv.identify.losses.objective import Objective
 from masiv.inference.correlation import effective_samples
-from masiv.inference.least_squares import (
-    FIRST_STEP,
-    Estimate,
-    Parameter,
-    covariance,
-    fit_parameters,
-    robust_cost,
-    robust_weight,
-)
+from masiv.inference.least_squares import FIRST_STEP, Estimate, covariance, fit_parameters, robust_cost, robust_weight
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.families import (
-    FAMILIES,
-    Family,
-    initial_state_from,
-    initial_state_parameters,
-    law_of,
-    mean_distance,
-)
-from masiv.models.problem import InitialState, Problem
+from masiv.models.families import FAMILIES, Family, law_of, mean_distance
+from masiv.models.initial_state import InitialState, initial_state_parameters
+from masiv.models.parameters import Parameter
+from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 MIN_COST_DECREASE = 1e-3
@@ -79,7 +66,7 @@ class FamilyFit:
 
     @property
     def initial_state(self) -> InitialState:
-        return initial_state_from(self.values)
+        return InitialState.of_values(self.values)
 
     def state(self) -> dict[str, Any]:
         """Plain values, as a checkpoint keeps them."""
@@ -263,7 +250,7 @@ def _clipped_step(parameters: list[Parameter], values: dict[str, float], step: n
 
 def _parameters(problem: Problem, family: Family, fit: FamilyFit) -> list[Parameter]:
     """The parameters of law and initial state, from the values of ``fit``."""
-    both = [*family.parameters, *initial_state_parameters(problem, fit.initial_state)]
+    both = [*family.parameters, *initial_state_parameters(fit.initial_state, problem.ground_range)]
     return [replace(p, start=float(np.clip(fit.values[p.name], p.lower, p.upper))) for p in both]
 
 

@@ -9,8 +9,8 @@ import torch
 
 from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.losses.objective import Objective
-from masiv.models.families import Family, Rollouts, initial_state_parameters, mean_distance
-from masiv.models.problem import InitialState
+from masiv.models.families import Family, Rollouts, mean_distance
+from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.progress import Progress
 
 CANDIDATES_WITH_ALL_CONTACTS = 3
@@ -50,7 +50,7 @@ def search_family(
     contacts = ["sticky", "release"] if objective.config.contact == "auto" else [objective.config.contact]
     if problem.scene.ground is None:
         contacts = ["none"]
-    start = {p.name: p.start for p in initial_state_parameters(problem, initial_state)}
+    start = {p.name: p.start for p in initial_state_parameters(initial_state, problem.ground_range)}
     starts = [{**candidate, **start} for candidate in family.candidates()]
     total = len(starts) + (len(contacts) - 1) * min(CANDIDATES_WITH_ALL_CONTACTS, len(starts))
     tried: list[_Candidate] = []

@@ -11,7 +11,7 @@ from masiv.identify.classical.fit import FamilyFit, fit_family, fit_further, sav
 from masiv.identify.classical.model_selection import image_losses, rank_by_bic, rank_by_image_loss
 from masiv.identify.losses.objective import Objective
 from masiv.models.families import FAMILIES
-from masiv.models.problem import InitialState
+from masiv.models.initial_state import InitialState
 from masiv.progress import Progress, silent
 from masiv.workers import TaskError, Workers
 

@@ -20,8 +20,8 @@ from masiv.errors import InputError, MasivError
 from masiv.identify.losses.objective import Objective
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
-from masiv.materials.pretrain import MATERIALS, pretrained_path
-from masiv.models.problem import InitialState
+from masiv.models.initial_state import InitialState
+from masiv.pretraining.pretrain import MATERIALS, pretrained_path
 from masiv.progress import Progress
 from masiv.workers import Workers, unwrap
 

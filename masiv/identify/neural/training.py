@@ -24,7 +24,7 @@ from masiv.identify.neural.training_state import TrainingState
 from masiv.identify.recording import FitRecording
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import InitialState
+from masiv.models.initial_state import InitialState
 from masiv.progress import Progress
 
 
