@@ -131,11 +131,10 @@ def held_out_trajectory(run: RunFolder, config: Config, scene: Scene, progress: 
     """
     if run.fit_frames >= scene.frame_count:
         return None
-    from masiv.continuum.extend import extend_trajectory
+    from masiv.continuum.extend_trajectory import extend_trajectory
     from masiv.continuum.trajectory import Trajectory
     from masiv.splat.dynamic import DynamicGaussians
-    from masiv.splat.follow import follow
-    from masiv.splat.follow_config import FollowConfig
+    from masiv.splat.extend_frames import ExtendFramesConfig, extend_frames
 
     folder = run.path / "held_out"
     path = folder / "trajectory.npz"
@@ -147,16 +146,16 @@ def held_out_trajectory(run: RunFolder, config: Config, scene: Scene, progress: 
     folder.mkdir(exist_ok=True)
     checkpoint = run.checkpoint("held_out_gaussians")
     if not (folder / "deformation.safetensors").is_file():
-        followed = follow(
+        extended = extend_frames(
             seen,
             load_dynamic(run),
             config.reconstruct,
-            FollowConfig.model_validate({}),
+            ExtendFramesConfig.model_validate({}),
             seed=config.seed,
             checkpoint=checkpoint,
             progress=progress,
         )
-        followed.save(folder)
+        extended.save(folder)
     checkpoint.clear()
     checkpoint = run.checkpoint("held_out_trajectory")
     trajectory = extend_trajectory(
@@ -201,12 +200,12 @@ def identified(run: RunFolder, config: Config, scene: Scene, progress: Progress)
 @contextmanager
 def described(run: RunFolder, config: Config, twin: Twin) -> Iterator[None]:
     """Beside what the body of this context does, in a process of its own, material.json is made where it lacks."""
-    from masiv.workers import Workers, processes_wanted, unwrap
+    from masiv.workers import Workers, process_count, unwrap
 
     if (run.path / MATERIAL).is_file():
         yield
         return
-    with Workers(min(2, processes_wanted(config.identify.processes)), "identify.processes") as workers:
+    with Workers(min(2, process_count(config.identify.processes)), "identify.processes") as workers:
         found = workers.submit(describe, (run, twin))
         yield
         unwrap(found())
