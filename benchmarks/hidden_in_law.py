@@ -10,6 +10,7 @@ the fitted frames, whole and without its pressure, and in uniaxial tension and c
 motion.
 """
 
+import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ FRAMES, STRAIN = 12, 0.12
 
 
 def main():
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     import torch
     from refine_tracks import ELASTIC, quiet
     from track_cases import Case, observed
@@ -95,7 +97,7 @@ def gone_through(twin):
 
 def stresses(law):
     """Axial Kirchhoff stress [Pa] over strains up to STRAIN in tension and compression, a second there and back."""
-    from masiv.materials.curves import there_and_back, uniaxial
+    from masiv.characterization.curves import there_and_back, uniaxial
 
     return np.concatenate([uniaxial(law, there_and_back(s, 20), 0.025).stress for s in (STRAIN, -STRAIN)])
 

@@ -43,9 +43,9 @@ def time_masiv(law_name, count, repeats, arch):
     runtime.start(arch)
     from masiv.materials.classical import ClassicalLaw
     from masiv.materials.load import load_law
-    from masiv.materials.pretrain import pretrained_path
     from masiv.mpm.rollout import at_rest, rollout
     from masiv.mpm.simulator import Simulator
+    from masiv.pretraining.pretrain import pretrained_path
 
     law = ClassicalLaw("neo_hookean", youngs_modulus=1e5, poissons_ratio=0.3)
     if law_name == "neural":

@@ -22,9 +22,8 @@ from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
 from masiv.scene.scene import Ground, Scene
+from masiv.shapes import ShapeSpec, make_body
 from masiv.simulation.simulate import rigid_initial_state
-from masiv.synth.shapes import make_body
-from masiv.synth.spec import ShapeSpec
 
 FPS = 24.0
 

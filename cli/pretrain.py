@@ -35,7 +35,7 @@ def pretrain(
     settings = load_config(preset, config, seed=seed, arch=arch)
     target = out or Path(f"{material}.safetensors")
     runtime.start(settings.arch)
-    from masiv.materials.pretrain import pretrain as teach
+    from masiv.pretraining.pretrain import pretrain as teach
 
     with progress_bar() as progress:
         law, quality = teach(material, seed=settings.seed, progress=progress)

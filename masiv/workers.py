@@ -22,8 +22,10 @@ from typing import Any
 from masiv import runtime
 from masiv.errors import InputError, MasivError
 
-THREAD_VARIABLES = ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Environment variables that limit the threads of a process."""
+ONE_THREAD = dict.fromkeys(
+    ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
+"""Environment variables that limit a process to one thread, if they are set before torch and Taichi are imported."""
 MAX_PROCESSES = 4
 
 
@@ -133,7 +135,7 @@ class Workers:
 
 def _initialize(arch: str) -> None:
     """Limit a new process to one thread and start Taichi. torch and Taichi are imported here at the earliest."""
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    os.environ.update(ONE_THREAD)
     import multiprocessing.util
 
     import torch

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from masiv.shapes import ShapeSpec, make_body
 from masiv.subsample import kd_tree_subset, random_subset
-from masiv.synth.shapes import make_body
-from masiv.synth.spec import ShapeSpec
 
 
 @given(st.data())

@@ -16,9 +16,9 @@ from masiv.materials import table
 from masiv.materials.classical import DIFFERENTIABLE, PARAMETERS, ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw, strain_invariants
-from masiv.materials.pretrain import MATERIALS, pretrained_path
 from masiv.mpm.rollout import at_rest
 from masiv.mpm.simulator import Simulator, State
+from masiv.pretraining.pretrain import MATERIALS, pretrained_path
 
 F64 = torch.float64
 EXAMPLES = {

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import torch
 
+from masiv.characterization import curves
+from masiv.characterization.describe import Quantity, describe, describe_twin, paragraph, said
+from masiv.characterization.excitation import Excited, excited_range, perturbed, sensitivities
 from masiv.errors import InputError, NonFiniteError
-from masiv.materials import curves
 from masiv.materials.classical import ClassicalLaw
-from masiv.materials.describe import Quantity, describe, describe_twin, paragraph, said
-from masiv.materials.excitation import Excited, excited_range, perturbed, sensitivities
 from masiv.materials.load import load_law
-from masiv.materials.pretrain import MATERIALS, pretrained_path
 from masiv.mpm.rollout import at_rest
+from masiv.pretraining.pretrain import MATERIALS, pretrained_path
 from masiv.report.material import material_section, read_material
 from masiv.report.page import Page
 

@@ -17,9 +17,9 @@ from masiv.identify.pictures import some_of_each
 from masiv.identify.stage import identify
 from masiv.identify.throw import Throw
 from masiv.materials.load import load_law
-from masiv.materials.pretrain import pretrained_path
 from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
+from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Frame
 from masiv.splat.rasteriser import render
 

@@ -14,9 +14,9 @@ from masiv.materials.blend import BlendedLaw, blend
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import strain_invariants
-from masiv.materials.pretrain import pretrained_path
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.simulator import Simulator
+from masiv.pretraining.pretrain import pretrained_path
 from masiv.report.film import balls
 from masiv.scene.scene import Ground
 from masiv.simulation.simulate import Push, simulate

@@ -11,10 +11,10 @@ from ring_scene import look_at, pixel_rays
 
 from masiv.errors import InputError
 from masiv.observations.read import read_scene
+from masiv.shapes import ShapeSpec, make_body
 from masiv.synth.motion import Skin, simulate
 from masiv.synth.picture import rasterise
-from masiv.synth.shapes import make_body
-from masiv.synth.spec import ShapeSpec, SynthSpec, read_spec
+from masiv.synth.spec import SynthSpec, read_spec
 from masiv.synth.synthesise import synthesise
 
 SMALL = {

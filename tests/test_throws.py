@@ -21,8 +21,8 @@ from test_identify import (  # noqa: F401  (fixtures)
     settings,
 )
 
-from cli.main import run
 from masiv.checkpoint import Checkpoint
+from masiv.cli.main import run
 from masiv.errors import InputError
 from masiv.identify.descent import Descent
 from masiv.identify.fit import fit
@@ -30,8 +30,8 @@ from masiv.identify.stage import identify
 from masiv.identify.throw import throw_of
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
-from masiv.materials.pretrain import pretrained_path
 from masiv.mpm.config import SimulatorConfig
+from masiv.pretraining.pretrain import pretrained_path
 from masiv.simulation.simulate import simulate
 from masiv.twin import Twin
 

@@ -14,7 +14,7 @@ import torch
 import yaml
 from tiny_scenes import springgaus_synthetic
 
-from masiv.cli import main, stages
+from masiv.cli import main
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
@@ -24,6 +24,7 @@ from masiv.models.problem import InitialState, Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.simulator import Simulator
+from masiv.pipeline import Overrides, open_run
 from masiv.report.page import Page
 from masiv.report.report import _effects_section
 from masiv.runfolder import STAGES
@@ -300,7 +301,7 @@ def test_what_is_wrong_in_twin_yaml_is_named(tmp_path, entries, message):
 
 
 def test_the_command_leaves_effects_out(tmp_path, monkeypatch, capfd):
-    run, _, _ = stages.open_run(springgaus_synthetic(tmp_path / "scene"), tmp_path / "run", preset="quick")
+    run = open_run(springgaus_synthetic(tmp_path / "scene"), tmp_path / "run", Overrides("quick")).folder
     for stage in STAGES:
         with run.stage(stage):
             pass

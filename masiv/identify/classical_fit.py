@@ -222,11 +222,11 @@ def fit_all_particles(
     parameters = _parameters(coarse, family, found)
     progress(label, 0, total)
     on_few = Misfit(coarse, family, found.contact, coarse.frames, pictures=pictures)
-    coarse = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
+    chord = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
     progress(label, 1, total)
     misfit = Misfit(problem, family, found.contact, problem.frames, pictures=pictures, chosen=coarse.chosen)
-    softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(coarse.residual))), 1e-12)
-    values, jacobian, scale = found.values, coarse.jacobian, 1.0
+    softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(chord.residual))), 1e-12)
+    values, jacobian, scale = found.values, chord.jacobian, 1.0
     best, residual = misfit(values)
     progress(label, 2, total, f"{1e3 * mean_distance(best):.1f} mm")
     for step in range(CHORD_STEPS):
@@ -247,7 +247,7 @@ def fit_all_particles(
         progress(label, 3 + step, total, f"{1e3 * mean_distance(best):.1f} mm")
     weight = robust_weight(residual, softness)
     spread = covariance(jacobian * weight[:, None], residual * weight)
-    estimate = Estimate(values, spread, jacobian, residual, coarse.evaluations + CHORD_STEPS + 1, tuple(parameters))
+    estimate = Estimate(values, spread, jacobian, residual, chord.evaluations + CHORD_STEPS + 1, tuple(parameters))
     found = _updated(coarse, found, _of_paths(estimate, misfit), 4)
     found.error_m = mean_distance(best)
     keep(checkpoint, found, f"{found.kind}, {ALL}")

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from masiv.characterization.curves import tabulated
 from masiv.errors import InputError, MasivError
 from masiv.materials.classical import ClassicalLaw
-from masiv.materials.curves import tabulated
 from masiv.materials.law import BoundLaw, Law
 from masiv.materials.neural import NeuralLaw
 

@@ -24,7 +24,7 @@ from masiv.files import write_npz
 from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, rms_mm
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.base import EffectTerm, WholeRunSplit
+from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit
 from masiv.models.cantilever_preload import across
 from masiv.models.free_body import Model
 from masiv.models.marker_body import Plan, SimulatedBody, plan, simulated_body
@@ -116,7 +116,7 @@ def body_run(
                    skip)  # fmt: skip
 
 
-class BodySimulation:
+class BodySimulation(SharedRollouts):
     """Runs of one body. known: values of law and effects that are not fitted; contact: with the ground."""
 
     def __init__(
@@ -141,7 +141,7 @@ class BodySimulation:
         self.ground = tracks.ground is not None
         self.across = np.concatenate([np.linalg.svd(tracks.up[None])[2][1:], tracks.up[None]])
         """Two horizontal axes and the vertical one (3, 3), world."""
-        self.rollouts = 0
+        super().__init__()
         self.substeps: dict[tuple[str, float], float] = {}
         self.kept: dict[tuple, CubicSpline] = {}
 

@@ -13,7 +13,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.inference.least_squares import Parameter
-from masiv.models.base import EffectTerm, WeightedResidual, effect_parameters, plain_term
+from masiv.models.base import EffectTerm, SharedRollouts, WeightedResidual, effect_parameters, plain_term
 from masiv.models.families import Family, initial_state_from, initial_state_parameters, law_of
 from masiv.models.problem import InitialState, Problem
 
@@ -136,7 +136,7 @@ def _run(
     return problem.run(law, throw, model.contact, frames, steps, active(model, values, problem))
 
 
-class Simulation:
+class Simulation(SharedRollouts):
     """Residuals of models. The number of substeps is held for a family, as in ``masiv.models.families``."""
 
     STABLE = 1.4
@@ -146,7 +146,7 @@ class Simulation:
     ) -> None:
         self.observations = tuple(observations)
         self.steps = {} if steps is None else steps
-        self.rollouts = 0
+        super().__init__()
         self.last: dict[int, tuple[tuple, torch.Tensor]] = {}
 
     def settle(self, model: Model, values: Mapping[str, float]) -> None:

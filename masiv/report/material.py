@@ -30,7 +30,7 @@ def read_material(run: Path) -> dict[str, Any] | None:
 
 
 def material_section(page: Page, material: Mapping[str, Any]) -> None:
-    """Adds the section of ``material`` (what ``masiv.materials.describe.Material.as_data`` gives) to ``page``."""
+    """Add the section of ``material`` (the content of material.json) to ``page``."""
     from masiv.report import plots
 
     page.heading("What is this material?")

@@ -105,7 +105,7 @@ def law_curves(law: Any) -> bytes:
 
 
 def material_curves(curves: Mapping[str, Mapping[str, Any]]) -> bytes:
-    """Stress over strain, a panel a curve of ``masiv.materials.describe.Material``; grey beyond what was observed."""
+    """Stress over strain, one panel for each curve of ``describe.Material``; grey beyond the observed range."""
     figure, axes = _figure(len(curves))
     for axis, (name, curve) in zip(axes, curves.items(), strict=True):
         strain, stress = np.asarray(curve["strain"]), np.asarray(curve["stress_pa"]) / 1e3

@@ -79,8 +79,7 @@ def with_mesh(twin: Twin, mesh: Path) -> Twin:
     A mesh says nothing of its unit, so its longest side is made the body's own; it takes the body's place as in
     ``with_body_of``. Raises InputError for a mesh that cannot be filled.
     """
-    from masiv.synth.shapes import make_body
-    from masiv.synth.spec import ShapeSpec
+    from masiv.shapes import ShapeSpec, make_body
 
     axes = SimulationFrame.from_scene(twin.up, twin.ground)
     size = float(np.ptp(axes.points_to_simulation(twin.positions.astype(np.float64)), axis=0).max())

@@ -26,7 +26,7 @@ from masiv.errors import MasivError
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.losses import Pairs
 from masiv.splat.objective import PARAMETER_NAMES, Objective, Part
-from masiv.workers import THREAD_VARIABLES, run_task, unwrap
+from masiv.workers import ONE_THREAD, run_task, unwrap
 
 Gradients = Sequence[torch.Tensor | None]
 EXIT_TIMEOUT_S = 10.0
@@ -55,7 +55,7 @@ class GradientWorker:
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(dir="/dev/shm" if os.path.isdir("/dev/shm") else None)
-        threads = dict.fromkeys(THREAD_VARIABLES, str(max(1, runtime.threads() // 2)))
+        threads = dict.fromkeys(ONE_THREAD, str(max(1, runtime.threads() // 2)))
         arguments = (json.dumps(sys.path), str(self._file.fileno()), str(torch.get_num_threads()))
         self._process = subprocess.Popen(
             [sys.executable, "-c", _COMMAND, *arguments],

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from masiv.errors import InputError
-from masiv.synth.shapes import Body
+from masiv.shapes import Solid
 from masiv.synth.spec import SynthSpec
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ _COURANT = 0.25
 _NEIGHBOURS = 16
 
 
-def simulate(spec: SynthSpec, body: Body) -> np.ndarray:
+def simulate(spec: SynthSpec, body: Solid) -> np.ndarray:
     """Positions (T, N, 3) float32 [m] of the body's particles at every frame.
 
     Frame 0 is the start, whatever effects say of the clock. Needs ``masiv.runtime.start``. Raises InputError for an

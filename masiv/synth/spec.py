@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from masiv.errors import InputError
+from masiv.shapes import ShapeSpec
 from masiv.strict import read_yaml, validated
 
 Vector = tuple[float, float, float]
@@ -15,23 +16,6 @@ Vector = tuple[float, float, float]
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ShapeSpec(_Part):
-    """The body at frame 0. Its bounding box is as long as ``size`` before it is turned; it floats over the ground."""
-
-    kind: Literal["cube", "sphere", "capsule", "cylinder", "torus", "cross", "mesh"] = "cube"
-    mesh: Path | None = Field(None, description="a watertight triangle mesh, for kind mesh; relative to the spec")
-    size: float = Field(0.5, gt=0, description="longest side [m]")
-    rotation_deg: Vector = Field((0, 0, 0), description="about the fixed axes x, then y, then z")
-    position: tuple[float, float] = Field((0, 0), description="x, z of the box's centre [m]")
-    clearance: float = Field(0.15, ge=0, description="lowest point above the ground [m]")
-
-    @model_validator(mode="after")
-    def _mesh_is_given(self) -> ShapeSpec:
-        if (self.kind == "mesh") != (self.mesh is not None):
-            raise ValueError("kind mesh and the key mesh go together")
-        return self
 
 
 class MaterialSpec(_Part):

@@ -14,9 +14,9 @@ import yaml
 from masiv.errors import InputError
 from masiv.progress import Progress, silent
 from masiv.scene.camera import Camera
+from masiv.shapes import make_body
 from masiv.synth.motion import Skin, simulate
 from masiv.synth.picture import Surface, background, enlarged, picture
-from masiv.synth.shapes import make_body
 from masiv.synth.spec import CameraSpec, SynthSpec
 
 _SMALL = [cv2.IMWRITE_PNG_COMPRESSION, 9]

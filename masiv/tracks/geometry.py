@@ -49,11 +49,11 @@ class Geometry:
     def _inside_mesh(self, counts: np.ndarray) -> np.ndarray:
         import trimesh
 
-        from masiv.synth.shapes import _inside
+        from masiv.mesh import lattice_inside
 
         # Crossings keep their parity when each axis is scaled by itself, so cells become unit cubes.
         scaled = (self.vertices - self.lower) * (counts / (self.upper - self.lower))
-        cube = _inside(trimesh.Trimesh(scaled, self.faces, process=False), np.arange(counts.max()) + 0.5)
+        cube = lattice_inside(trimesh.Trimesh(scaled, self.faces, process=False), np.arange(counts.max()) + 0.5)
         return cube[: counts[0], : counts[1], : counts[2]]
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from masiv.characterization.curves import deviatoric_strain, moduli_at_rest
 from masiv.errors import InputError, NonFiniteError
 from masiv.materials.classical import ClassicalLaw
-from masiv.materials.curves import deviatoric_strain, moduli_at_rest
 from masiv.materials.law import Law
 from masiv.materials.neural import NeuralLaw
 

@@ -1,22 +1,43 @@
-"""Bodies as surface meshes and as the particles that fill them."""
+"""Solids as surface meshes and as the particles that fill them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import trimesh
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from masiv.mesh import read_mesh
-from masiv.synth.spec import ShapeSpec
+from masiv.mesh import lattice_inside, read_mesh
 
 _FACETS_ALONG = 30
-"""Edges are at most this share of the size, so that the surface can bend."""
+"""Edges are at most 1 / 30 of the size, so that the surface can bend."""
+
+
+class ShapeSpec(BaseModel):
+    """A solid over the ground (y = 0). The longest side of its bounding box is ``size`` before it is turned."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    kind: Literal["cube", "sphere", "capsule", "cylinder", "torus", "cross", "mesh"] = "cube"
+    mesh: Path | None = Field(None, description="a watertight triangle mesh, for kind mesh; relative to the spec")
+    size: float = Field(0.5, gt=0, description="longest side [m]")
+    rotation_deg: tuple[float, float, float] = Field((0, 0, 0), description="about the fixed axes x, then y, then z")
+    position: tuple[float, float] = Field((0, 0), description="x, z of the box's centre [m]")
+    clearance: float = Field(0.15, ge=0, description="lowest point above the ground [m]")
+
+    @model_validator(mode="after")
+    def _mesh_is_given(self) -> ShapeSpec:
+        if (self.kind == "mesh") != (self.mesh is not None):
+            raise ValueError("kind mesh and the key mesh go together")
+        return self
 
 
 @dataclass(frozen=True)
-class Body:
+class Solid:
     """A body at rest: vertices (V, 3) [m, world], faces (F, 3) counter-clockwise from outside, particles (N, 3) [m],
     volume [m^3], local (V, 3) the vertices in the shape's own axes, in units of its size: where its texture is."""
 
@@ -27,7 +48,7 @@ class Body:
     local: np.ndarray
 
 
-def make_body(spec: ShapeSpec, particle_count: int) -> Body:
+def make_body(spec: ShapeSpec, particle_count: int) -> Solid:
     """The body of ``spec`` filled with about ``particle_count`` particles. Raises InputError for an unusable mesh."""
     solids = _solids(spec)
     corners = np.concatenate([solid.vertices for solid in solids])
@@ -45,7 +66,7 @@ def make_body(spec: ShapeSpec, particle_count: int) -> Body:
     low, high = vertices.min(0), vertices.max(0)
     shift = np.array([spec.position[0], spec.clearance, spec.position[1]])
     shift -= [(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2]
-    return Body(vertices + shift, faces, particles + shift, len(lattice) * (spacing * spec.size) ** 3, local)
+    return Solid(vertices + shift, faces, particles + shift, len(lattice) * (spacing * spec.size) ** 3, local)
 
 
 def _solids(spec: ShapeSpec) -> list[trimesh.Trimesh]:
@@ -82,31 +103,7 @@ def _fill(solids: list[trimesh.Trimesh], count: int) -> tuple[np.ndarray, float]
         axis = np.arange(-0.87 + spacing / 2, 0.87, spacing)
         inside = np.zeros((len(axis),) * 3, bool)
         for solid in solids:
-            inside |= _inside(solid, axis)
+            inside |= lattice_inside(solid, axis)
         spacing *= (max(inside.sum(), 1) / count) ** (1 / 3)
         found, used = np.argwhere(inside), axis
     return used[found] @ askew, used[1] - used[0]
-
-
-def _inside(mesh: trimesh.Trimesh, axis: np.ndarray) -> np.ndarray:
-    """Which points of the lattice axis x axis x axis are inside, (A, A, A) bool, by the parity of crossings along z."""
-    count, step = len(axis), axis[1] - axis[0]
-    # Off the lattice by a hair, so that no column runs along an edge.
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] - [1.3e-7, 2.9e-7, 0] for k in range(3))
-    crossings = np.zeros((count, count, count + 1), np.int32)
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    for i in np.flatnonzero(np.abs(area) > 1e-14):
-        corner = np.stack([a[i], b[i], c[i]])
-        low = np.maximum(np.ceil((corner[:, :2].min(0) - axis[0]) / step).astype(int), 0)
-        high = np.minimum(np.floor((corner[:, :2].max(0) - axis[0]) / step).astype(int) + 1, count)
-        if (high <= low).any():
-            continue
-        x, y = np.meshgrid(axis[low[0] : high[0]], axis[low[1] : high[1]], indexing="ij")
-        u = ((x - a[i, 0]) * (c[i, 1] - a[i, 1]) - (y - a[i, 1]) * (c[i, 0] - a[i, 0])) / area[i]
-        v = ((b[i, 0] - a[i, 0]) * (y - a[i, 1]) - (b[i, 1] - a[i, 1]) * (x - a[i, 0])) / area[i]
-        hit = (u >= 0) & (v >= 0) & (u + v <= 1)
-        z = a[i, 2] + u * (b[i, 2] - a[i, 2]) + v * (c[i, 2] - a[i, 2])
-        first = np.clip(np.ceil((z - axis[0]) / step).astype(int), 0, count)
-        rows, columns = np.nonzero(hit)
-        np.add.at(crossings, (rows + low[0], columns + low[1], first[hit]), 1)
-    return np.cumsum(crossings, axis=2)[:, :, :count] % 2 == 1

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from masiv.materials import curves
-from masiv.materials.excitation import Excited, Sensitivity, excited_range, sensitivities
-from masiv.materials.families import Match, nearest_families
+from masiv.characterization import curves
+from masiv.characterization.excitation import Excited, Sensitivity, excited_range, sensitivities
+from masiv.characterization.families import Match, nearest_families
 from masiv.materials.law import Law
 from masiv.progress import Progress, silent
+from masiv.subsample import kd_tree_subset
 
 if TYPE_CHECKING:
     from masiv.twin import Twin
@@ -109,7 +110,7 @@ def describe_twin(
     from masiv import runtime
     from masiv.simulation.simulate import march, simulate
 
-    chosen = np.linspace(0, len(twin.positions) - 1, min(particles, len(twin.positions))).round().astype(int)
+    chosen = kd_tree_subset(twin.positions.astype(np.float64), particles)
     few = replace(twin, positions=twin.positions[chosen], simulator=twin.simulator.model_copy(update={"split": 1}))
     done = 0
 

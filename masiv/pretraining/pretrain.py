@@ -15,11 +15,11 @@ from pathlib import Path
 import torch
 
 from masiv.errors import InputError
-from masiv.materials import cohesionless
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.neural import NeuralLaw, strain_invariants
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulator import Simulator, State
+from masiv.pretraining import cohesionless
 from masiv.progress import Progress, silent
 
 # Parameters of NCLaw's throws (notes of its experiments: E, nu, yield stress, friction angle); jelly is neo-Hookean

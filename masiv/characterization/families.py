@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
+from masiv.characterization import curves
 from masiv.errors import InputError
-from masiv.materials import curves
 from masiv.materials.classical import PARAMETERS, UNITS, ClassicalLaw
 from masiv.materials.law import Law
 

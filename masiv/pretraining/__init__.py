@@ -1,0 +1,1 @@
+"""Neural laws taught from simulated classical materials: what ``identify`` starts from."""
