@@ -11,7 +11,6 @@ differs from NeuMA: that adds low-rank matrices to the weights of a neural law, 
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -179,20 +178,15 @@ def hencky_size(invariants: torch.Tensor) -> torch.Tensor:
     return torch.sqrt(torch.relu(square) / (1 + (first + second) / 6) / 16 + TINY**2)
 
 
-@functools.lru_cache(maxsize=8)
-def _adapter_kernels(mpm):
-    from masiv.kernels.laws import InvariantKernels
-
-    return InvariantKernels(mpm)
-
-
 class _BoundAdapter(BoundLaw):
     """Coefficients from torch between two kernels: invariants out, coefficients in."""
 
     def __init__(self, law: AdapterLaw, mpm: MpmKernels, count: int, dt: float) -> None:
+        from masiv.kernels.law_kernels import InvariantKernels
+
         self.law = law
         self.dt = dt
-        self.kernels = _adapter_kernels(mpm)
+        self.kernels = mpm.attached(InvariantKernels, lambda: InvariantKernels(mpm))
         self.trained = [p for p in law.parameters() if p.requires_grad]
         self.sums = [torch.zeros_like(p) for p in self.trained]
         dtype = law.hidden.weight.dtype

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 from typing import TYPE_CHECKING, Any
@@ -185,22 +184,17 @@ def isochoric_flow(f: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
     return torch.linalg.det(m)[:, None, None] ** (-1 / 3) * (m @ f)
 
 
-@functools.lru_cache(maxsize=8)
-def _classical_kernels(mpm, kind: str, coefficients: int):
-    from masiv.kernels.laws import ClassicalKernels
-
-    return ClassicalKernels(mpm, kind, coefficients)
-
-
 class _BoundClassical(SharedBoundLaw):
     def __init__(self, law: ClassicalLaw, mpm: MpmKernels, count: int, dt: float) -> None:
         self.law = law
         self.dt = dt
         self.mpm = mpm
         self.values = law.coefficients(dt)
-        self.kernels = _classical_kernels(mpm, law.kind, len(self.values))
-        dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
-        self.per_particle = self.values.detach().to(dtype).expand(count, -1).contiguous()
+        from masiv.kernels.law_kernels import ClassicalKernels
+
+        count_of = len(self.values)
+        self.kernels = mpm.attached((ClassicalKernels, law.kind), lambda: ClassicalKernels(mpm, law.kind, count_of))
+        self.per_particle = self.values.detach().to(mpm.torch_dtype).expand(count, -1).contiguous()
         self._own()
 
     def write(self) -> None:

@@ -37,7 +37,7 @@ def interpolate(table: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
     return out
 
 
-def gentle(values: torch.Tensor) -> torch.Tensor:
+def lipschitz_envelope(values: torch.Tensor) -> torch.Tensor:
     """The largest table below ``values`` (K, C) that changes by no more than 1 for a unit of any feature.
 
     The lower envelope of cones with L1 distance, one sweep to and fro along each axis (Felzenszwalb & Huttenlocher
