@@ -10,7 +10,7 @@ BIN = $(VENV)/bin
 INSTALLED = $(VENV)/installed
 RUN = runs/demo
 
-.PHONY: demo test lint wheel-test bench clean install
+.PHONY: demo test test-all lint wheel-test bench clean install
 
 install: $(INSTALLED)
 
@@ -26,8 +26,15 @@ demo: $(INSTALLED)
 	$(BIN)/masiv evaluate $(RUN) --truth assets/sample/gt --arch $(ARCH)
 	@echo "open $(RUN)/report.html"
 
+# Two processes of one thread each (tests/conftest.py); a file's tests share what its fixtures make.
+PYTEST = $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+
 test: lint
-	$(BIN)/python -m pytest
+	$(PYTEST) -m "not slow"
+
+# Exit code 5 of pytest: no test is marked.
+test-all: wheel-test
+	$(PYTEST) -m slow || test $$? -eq 5
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
@@ -37,8 +44,13 @@ lint: $(INSTALLED)
 wheel-test: $(INSTALLED)
 	$(BIN)/python tests/wheel/check.py $(if $(TORCH_INDEX),--torch-index $(TORCH_INDEX))
 
+# Those that need no scene, run or measurement; refine_tracks, which needs none either, is one case after the other.
+BENCHMARKS = dam_break dissipation hidden_in_law mpm_speed transfer
+
 bench: $(INSTALLED)
-	for file in benchmarks/*.py; do $(BIN)/python $$file || exit 1; done
+	@for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
+	@echo "== the others need arguments, or hours:"
+	@grep -h "^    python benchmarks/" $(filter-out $(BENCHMARKS:%=benchmarks/%.py),$(wildcard benchmarks/*.py))
 
 clean:
 	rm -rf $(VENV) build runs *.egg-info .pytest_cache .ruff_cache .hypothesis

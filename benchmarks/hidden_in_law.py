@@ -10,6 +10,7 @@ the fitted frames, whole and without its pressure, and in uniaxial tension and c
 motion.
 """
 
+import argparse
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ FRAMES, STRAIN = 12, 0.12
 
 
 def main():
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     import torch
     from refine_tracks import ELASTIC, quiet
     from track_cases import Case, observed

@@ -30,15 +30,16 @@ import yaml
 from identification_table import tables
 from parameters import FAMILY, true_parameters
 
-from masiv.cli import stages
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.metrics import chamfer_floor
-from masiv.models.initial_motion import estimate_initial_motion
+from masiv.models.initial_state import estimate_initial_motion
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing
 from masiv.observations.read import read_scene
+from masiv.pipeline import Overrides, SceneRequest, open_run, stages
+from masiv.pipeline.video import VideoRun
 from masiv.report.measure import motion_numbers, read_truth
 from masiv.report.numbers import twin_numbers
 from masiv.runfolder import RunFolder
@@ -97,10 +98,8 @@ def base_run(case: Case, out: Path, preset: str, fit_frames: int) -> Path:
     if (folder / "run.yaml").is_file() and RunFolder.open(folder).done("trajectory"):
         return folder
     config = overrides(upstream, out / "config.yaml")
-    run, settings, scene = stages.open_run(
-        case.scene, folder, preset=preset, config=config, seed=case.seed, fit_frames=fit_frames
-    )
-    stages.estimated(run, settings, scene, said)
+    run = open_run(case.scene, folder, Overrides(preset, config, case.seed), SceneRequest(fit_frames))
+    run.trajectory(said)
     return folder
 
 
@@ -116,21 +115,25 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
         (folder / "run.yaml").write_text(yaml.safe_dump(record, sort_keys=False), encoding="utf-8")
     family = FAMILY[truth_of(case.scene)["material"]["type"]]
     also = [base_run(dataclasses.replace(case, scene=scene), out, preset, fit_frames) for scene in case.also]
-    run, settings, scene = stages.open_run(
-        case.scene, folder, preset=preset, config=overrides(case.settings, out / "config.yaml"), seed=case.seed,
-        fit_frames=fit_frames, law=family if case.law in ("true", "told") else case.law,
-        geometry_loss=case.geometry_loss, pictures=None if case.silhouette else 0,
-        also=[str(path.resolve()) for path in also] or None,
-    )  # fmt: skip
-    stages.start(settings)
+    asked = {
+        "law": family if case.law in ("true", "told") else case.law,
+        "geometry_loss": case.geometry_loss,
+        "pictures": None if case.silhouette else 0,
+        "also": [str(path.resolve()) for path in also] or None,
+    }
+    settings_of_case = Overrides(preset, overrides(case.settings, out / "config.yaml"), case.seed)
+    opened = open_run(case.scene, folder, settings_of_case, SceneRequest(fit_frames, identify=asked))
+    assert isinstance(opened, VideoRun)
+    opened.start()
+    run, settings, scene = opened.folder, opened.config, opened.scene
     trajectory = stages.load_trajectory(run)
     if case.law == "told":
         told(case.scene, scene, trajectory, settings.simulator).save(run.path)
     elif not run.done("identify"):
         with run.stage("identify") as checkpoint:
             identify(
-                stages.fitted_scene(run, scene), trajectory, settings.identify, settings.simulator,
-                others=stages.other_throws(settings), seed=settings.seed, checkpoint=checkpoint, progress=said,
+                stages.training_scene(run, scene), trajectory, settings.identify, settings.simulator,
+                others=stages.other_recordings(settings), seed=settings.seed, checkpoint=checkpoint, progress=said,
             ).save(run.path)  # fmt: skip
     twin = Twin.load(run.path)
     rollout = simulate(twin, frames=scene.frame_count, fps=scene.fps).positions
@@ -162,7 +165,7 @@ def measured(
     law = twin.law.description()
     expected = true_parameters(truth) if law["kind"] == FAMILY[truth["type"]] else {}
     splits = {"observed": range(run.fit_frames), "future": range(run.fit_frames, scene.frame_count)}
-    seen = twin_numbers(run, scene, stages.load_dynamic(run), rollout)
+    seen = twin_numbers(run, scene, stages.load_gaussians(run), rollout)
     numbers = {}
     for split, frames in splits.items():
         pictures = seen[split] or {}

@@ -36,20 +36,21 @@ def true_effects(truth):
 def measured(run, truth_file, second, given):
     from oracle import oracle
 
-    from masiv.cli import refining, stages
     from masiv.config import RefineConfig
+    from masiv.pipeline import reopen_run
+    from masiv.pipeline.refine_video import load_identified_twin, recording_of
     from masiv.refine.stage import refine
     from masiv.refine.summary import summary
 
     truth = yaml.safe_load(truth_file.read_text())
     throws, began = [], time.time()
     for path in [run, *second]:
-        folder, settings, scene = stages.reopen_run(path, preset=None, config=None, seed=None, arch=None)
+        opened = reopen_run(path)
         if not throws:
-            stages.start(settings)
-            first = settings
-        throws.append(refining.throw_of(path, folder, settings, scene, quiet))
-    twin = refining.load_twin(run)
+            opened.start()
+            first = opened.config
+        throws.append(recording_of(opened, quiet))
+    twin = load_identified_twin(run)
     config = RefineConfig.model_validate({**first.refine.model_dump(), **given})
     start = twin.fit.get("start") or twin.fit.get("law")
     loaded = time.time()

@@ -47,7 +47,7 @@ def command(function: Callable[..., tuple[dict[str, Any], str]]) -> Callable[...
             )
         else:
             if as_json:
-                from masiv.runfolder import plain
+                from masiv.files import plain
 
                 text = json.dumps(plain(data), allow_nan=False)
             print(text)

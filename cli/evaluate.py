@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, overrides
 
 
 def evaluate(
@@ -28,28 +28,11 @@ def evaluate(
 
     Tracks: errors of the runs, those that were held out apart: `masiv evaluate runs/beam`
     """
-    from masiv.errors import InputError
+    from masiv.pipeline import reopen_run
 
-    from . import stages, tracked
     from .console import progress_bar
 
-    if tracked.is_run(run):
-        tracked.refused(truth=truth)
-        return tracked.evaluate(*tracked.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch))
-    if truth is None:
-        raise InputError("--truth is missing: give the folder with particles_F.npy")
-    folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
-    folder.require("trajectory")
-    stages.start(settings)
-    from masiv.report.numbers import evaluation_numbers, table
-    from masiv.runfolder import load_motion, write_json
-    from masiv.twin import Twin
-
-    dynamic, trajectory = stages.load_dynamic(folder), stages.load_trajectory(folder)
-    twin, rollout = None, None
-    if folder.done("identify") and folder.rollout.is_file():
-        twin, (rollout, _) = Twin.load(run), load_motion(folder.rollout)
+    opened = reopen_run(run, overrides(preset, config, seed, arch))
     with progress_bar() as progress:
-        numbers = evaluation_numbers(folder, scene, dynamic, trajectory, twin, rollout, truth, progress=progress)
-    write_json(folder.evaluation, numbers)
-    return {"evaluation": str(folder.evaluation), **numbers}, f"{table(numbers)}\n{folder.evaluation}"
+        result = opened.evaluate(truth, progress)
+    return result.data, result.text

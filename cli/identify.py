@@ -16,6 +16,7 @@ from .options import (
     PresetOption,
     SceneArgument,
     SeedOption,
+    overrides,
 )
 
 
@@ -69,75 +70,18 @@ def identify(
 
     A classical baseline: `masiv identify scenes/bunny --out runs/bunny-elastic --law neo_hookean`
     """
-    from . import stages, tracked
+    from masiv.pipeline import SceneRequest, open_run
+
     from .console import progress_bar
 
-    if tracked.is_scene(scene):
-        tracked.refused(
-            fit_frames=fit_frames,
-            holdout_camera=holdout,
-            geometry_loss=geometry_loss,
-            no_silhouette=no_silhouette,
-            also=also,
-        )
-        folder = out or Path("runs") / scene.resolve().name
-        opened = tracked.open_run(scene, folder, preset=preset, config=config, seed=seed, arch=arch, law=law)
-        return tracked.identify(*opened)
-    run, settings, read = stages.open_run(
-        scene,
-        out or Path("runs") / scene.resolve().name,
-        preset=preset,
-        config=config,
-        seed=seed,
-        arch=arch,
-        fit_frames=fit_frames,
-        holdout=holdout,
-        law=law,
-        also=[str(path.resolve()) for path in also] if also else None,
-        geometry_loss=geometry_loss,
-        pictures=0 if no_silhouette else None,
-    )
-    stages.start(settings)
-    from masiv.report.numbers import material_numbers, run_numbers, table
-    from masiv.report.report import write_report
-    from masiv.runfolder import write_json
-    from masiv.simulation.simulate import simulate
-
+    asked = {
+        "law": law,
+        "also": [str(path.resolve()) for path in also] if also else None,
+        "geometry_loss": geometry_loss,
+        "pictures": 0 if no_silhouette else None,
+    }
+    request = SceneRequest(fit_frames, tuple(holdout or ()), asked, no_silhouette)
+    run = open_run(scene, out, overrides(preset, config, seed, arch), request)
     with progress_bar() as progress:
-        dynamic = stages.reconstructed(run, settings, read, progress)
-        trajectory = stages.estimated(run, settings, read, progress)
-        twin = stages.identified(run, settings, read, progress)
-        with stages.described(run, settings, twin):
-            motion = simulate(twin, frames=read.frame_count, fps=read.fps, progress=progress)
-            motion.save(run.rollout)
-            numbers = run_numbers(run, read, dynamic, trajectory, motion.positions)
-        numbers |= material_numbers(run)
-        write_json(run.metrics, numbers)
-        progress("report", 0, 1)
-        write_report(run, read, dynamic, trajectory, twin, motion.positions, numbers)
-        progress("report", 1, 1)
-    described = twin.law.description()
-    data = {"run": str(run.path), "report": str(run.report), "law": described, "metrics": numbers}
-    families = twin.fit.get("families", [])
-    if families:
-        data["families"] = families
-    return data, f"{table(numbers)}\n{_law_text(described, families)}report   {run.report}"
-
-
-def _law_text(described: dict[str, Any], families: list[dict[str, Any]]) -> str:
-    """The parameters of a law with their standard errors, and how well each family did where several were fitted."""
-    lines = [f"law      {described['kind']}"]
-    for name, entry in described["parameters"].items():
-        line = f"         {name.replace('_', ' ')} {entry['value']:.4g} {entry['unit']}"
-        if "stderr" in entry:
-            known = entry["stderr"] is not None
-            line += f" ± {entry['stderr']:.2g}" if known else " (the motion does not tell it)"
-        lines.append(line)
-    for row in families:
-        if "failed" in row:
-            lines.append(f"         {row['law']}: failed, {row['failed']}")
-        else:
-            seen = row["picture_error"]
-            nearness = f"BIC {row['bic_above_best']:.0f} above the best" if seen is None else f"pictures {seen:.3f}"
-            lines.append(f"         {row['law']}: {row['trajectory_error_mm']:.1f} mm from the paths, {nearness}")
-    return "\n".join(lines) + "\n"
+        result = run.identify(progress)
+    return result.data, result.text

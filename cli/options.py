@@ -10,6 +10,8 @@ import typer
 if TYPE_CHECKING:
     import numpy as np
 
+    from masiv.pipeline import Overrides
+
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a scene.", show_default=False)]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.", show_default=False)]
 ConfigOption = Annotated[
@@ -25,6 +27,13 @@ FitFramesOption = Annotated[
 HoldoutOption = Annotated[
     list[int] | None, typer.Option("--holdout-camera", help="Keep camera K out of training; may be repeated.")
 ]
+
+
+def overrides(preset: str | None, config: Path | None, seed: int | None, arch: str | None) -> Overrides:
+    """The settings that a command was given."""
+    from masiv.pipeline import Overrides
+
+    return Overrides(preset, config, seed, arch)
 
 
 def vector(text: str | None, flag: str) -> np.ndarray | None:

@@ -16,6 +16,7 @@ from .options import (
     PresetOption,
     SceneArgument,
     SeedOption,
+    overrides,
 )
 
 
@@ -34,28 +35,12 @@ def reconstruct(
 
     Example: `masiv reconstruct scenes/bunny --out runs/bunny --preset quick --holdout-camera 3`
     """
-    from . import stages
+    from masiv.pipeline import SceneRequest, open_run
+
     from .console import progress_bar
 
-    run, settings, read = stages.open_run(
-        scene,
-        out,
-        preset=preset,
-        config=config,
-        seed=seed,
-        arch=arch,
-        fit_frames=fit_frames,
-        holdout=holdout,
-    )
-    from masiv.report.numbers import reconstruction_numbers, table
-
+    request = SceneRequest(fit_frames, tuple(holdout or ()))
+    run = open_run(scene, out, overrides(preset, config, seed, arch), request)
     with progress_bar() as progress:
-        dynamic = stages.reconstructed(run, settings, read, progress)
-    numbers = reconstruction_numbers(run, read, dynamic)
-    data = {
-        "run": str(run.path),
-        "gaussians": len(dynamic.canonical),
-        "reconstruction": numbers,
-        "seconds": run.seconds(),
-    }
-    return data, f"{run.path}: {len(dynamic.canonical)} Gaussians\n{table({'reconstruction': numbers})}"
+        result = run.reconstruct(progress)
+    return result.data, result.text

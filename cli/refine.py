@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, overrides
 
 
 def refine(
@@ -41,46 +41,12 @@ def refine(
 
     Tracks: `masiv refine runs/balls --group`, `masiv refine runs/beam --condition load`
     """
-    from masiv.errors import InputError
+    from masiv.pipeline import RefineRequest, reopen_run
 
-    from . import stages, tracked
     from .console import progress_bar
 
-    if tracked.is_run(run):
-        tracked.refused(second_run=second)
-        opened = tracked.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
-        return tracked.refine(*opened, group=group, condition=condition, dry_run=dry_run)
-    if group or condition is not None:
-        raise InputError(f"{run} is of a scene of pictures: --group and --condition are for tracks")
-    folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
-    folder.require("identify")
-    runs = [(run, folder, scene)]
-    if second is not None:
-        other, _, other_scene = stages.reopen_run(second, preset=None, config=None, seed=None, arch=arch)
-        other.require("trajectory")
-        runs.append((second, other, other_scene))
-    stages.start(settings)
-    from masiv.refine.stage import refine as search
-    from masiv.refine.summary import text
-
-    from .refining import load_twin, save, throw_of
-
+    request = RefineRequest(second, group, condition, dry_run, relearn)
+    opened = reopen_run(run, overrides(preset, config, seed, arch))
     with progress_bar() as progress:
-        throws = [throw_of(path, f, settings, s, progress) for path, f, s in runs]
-        twin = load_twin(run)
-        found = search(
-            throws,
-            settings.identify,
-            settings.simulator,
-            settings.refine,
-            start=twin.fit.get("start") or twin.fit.get("law"),
-            dry_run=dry_run,
-            checkpoint=folder.checkpoint("refine"),
-            progress=progress,
-        )
-        document = save(
-            folder, scene, throws[0], found, twin, settings.refine, dry_run, progress,
-            relearn_with=settings if relearn else None,
-        )  # fmt: skip
-    folder.checkpoint("refine").clear()
-    return {"refine": str(run / "refine.json"), **document}, text(document)
+        result = opened.refine(request, progress)
+    return result.data, result.text

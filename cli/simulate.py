@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, vector
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, overrides, vector
 
 
 def simulate(
@@ -63,72 +62,29 @@ def simulate(
 
     Another: `masiv simulate runs/bunny --frames 32 --law runs/cross --blend 0.5 --force=0,0,900 --force-until 0.1`
     """
-    from masiv.errors import InputError
+    from masiv.pipeline import SimulateRequest, reopen_run
 
-    from . import stages, tracked
     from .console import progress_bar
 
-    thrown = vector(velocity, "--velocity"), vector(omega, "--omega"), vector(gravity, "--gravity")
-    if tracked.is_run(run):
-        tracked.refused(
-            velocity=velocity, omega=omega, law=law, blend=blend, geometry=geometry, density=density, ground=ground,
-            force=force, force_from=force_from, force_until=force_until, render=render, view=view,
-        )  # fmt: skip
-        opened = tracked.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
-        return tracked.simulate(
-            *opened,
-            frames=frames,
-            gravity=thrown[2],
-            without=without or [],
-            condition=condition,
-            out=out or run / "simulate",
-        )
-    if condition is not None:
-        raise InputError(f"{run} is of a scene of pictures: --condition is for tracks")
-    folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
-    folder.require("identify")
-    views = view or [0]
-    for index in views:
-        if not 0 <= index < len(scene.cameras):
-            raise InputError(f"--view {index}: the scene has cameras 0 to {len(scene.cameras) - 1}")
-    target = out or run / "simulate"
-    pushed = force_from is not None or force_until is not None
-    if force is None and pushed:
-        raise InputError("--force-from and --force-until need --force FX,FY,FZ")
-    if blend is not None and law is None:
-        raise InputError("--blend W needs --law OTHER_RUN, the run whose material is blended in")
-    strength = vector(force, "--force")
-    stages.start(settings)
-    from masiv.report.film import film
-    from masiv.simulation.simulate import Push
-    from masiv.simulation.simulate import simulate as roll
-    from masiv.simulation.twin_effects import body_mass
-    from masiv.simulation.variation import without_effects
-
-    push = None
-    if strength is not None:
-        until = float("inf") if force_until is None else force_until
-        push = Push(strength, 0.0 if force_from is None else force_from, until)
-    twin, look = stages.varied(folder, law=law, blend=blend, geometry=geometry, density=density, ground=ground)
-    twin = without_effects(twin, tuple(without or ()))
+    request = SimulateRequest(
+        frames,
+        velocity=vector(velocity, "--velocity"),
+        omega=vector(omega, "--omega"),
+        gravity=vector(gravity, "--gravity"),
+        law=law,
+        blend=blend,
+        geometry=geometry,
+        density=density,
+        ground=ground,
+        force=vector(force, "--force"),
+        force_from=force_from,
+        force_until=force_until,
+        without=tuple(without or ()),
+        condition=condition,
+        render=render,
+        view=tuple(view or ()),
+    )
+    opened = reopen_run(run, overrides(preset, config, seed, arch))
     with progress_bar() as progress:
-        motion = roll(
-            twin, frames=frames, fps=scene.fps, velocity=thrown[0], omega=thrown[1], gravity=thrown[2], push=push,
-            progress=progress,
-        )  # fmt: skip
-        target.mkdir(parents=True, exist_ok=True)
-        motion.save(target / "rollout.npz")
-        if render:
-            seen = replace(scene, ground=scene.ground if ground is None else twin.ground)
-            film(seen, look(), motion.positions, views, target, progress=progress)
-    data = {
-        "rollout": str(target / "rollout.npz"),
-        "frames": frames,
-        "particles": motion.positions.shape[1],
-        "mass_kg": body_mass(twin),
-        "law": twin.law.description(),
-        "effects": [effect.name for effect in twin.effects],
-    }
-    if render:
-        data["video"] = str(target / "video.mp4")
-    return data, "\n".join(str(data[name]) for name in ("rollout", "video") if name in data)
+        result = opened.simulate(request, out or run / "simulate", progress)
+    return result.data, result.text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, overrides
 
 
 def trajectory(
@@ -19,21 +19,11 @@ def trajectory(
 
     Example: `masiv trajectory runs/bunny`
     """
-    from . import stages
+    from masiv.pipeline import reopen_run
+
     from .console import progress_bar
 
-    folder, settings, scene = stages.reopen_run(run, preset=preset, config=config, seed=seed, arch=arch)
+    opened = reopen_run(run, overrides(preset, config, seed, arch))
     with progress_bar() as progress:
-        made = stages.estimated(folder, settings, scene, progress)
-    frames, particles = made.positions.shape[:2]
-    data = {
-        "run": str(run),
-        "trajectory": str(folder.trajectory),
-        "frames": frames,
-        "particles": particles,
-        "spacing_m": made.spacing,
-        "volume_m3": made.volume,
-        "seconds": folder.seconds(),
-    }
-    text = f"{folder.trajectory}: {particles} particles, {frames} frames, {made.spacing * 1e3:.1f} mm apart"
-    return data, f"{text}, {made.volume * 1e3:.2f} litres"
+        result = opened.trajectory(progress)
+    return result.data, result.text

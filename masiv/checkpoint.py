@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from masiv.files import atomic
 
 
 class Checkpoint:
@@ -35,15 +36,13 @@ class Checkpoint:
             self.save(make_state())
 
     def save(self, state: dict[str, Any]) -> None:
-        """Save now, to a temporary name that is then renamed."""
+        """Save now, completely or not at all."""
         if self.path is None:
             return
         import torch
 
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.path.with_suffix(".tmp")
-        torch.save(state, temporary)
-        os.replace(temporary, self.path)
+        with atomic(self.path) as temporary:
+            torch.save(state, temporary)
         self._last = time.monotonic()
 
     def clear(self) -> None:

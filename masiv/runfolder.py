@@ -1,14 +1,11 @@
 """The run folder: names of its files, what was asked, and how far each stage is.
 
-``run.yaml`` is written whole to a temporary name and renamed, so a killed run leaves a readable one. A stage that is
+``run.yaml`` is written completely or not at all, so a killed run leaves a readable one. A stage that is
 ``running`` in it was interrupted or failed; starting it again goes on from its checkpoint.
 """
 
 from __future__ import annotations
 
-import json
-import math
-import os
 import platform
 import time
 from collections.abc import Iterator, Mapping
@@ -20,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
+from masiv.files import write_yaml
 from masiv.strict import read_yaml
 
 SCHEMA = 1
@@ -193,10 +190,7 @@ class RunFolder:
         self.record["versions"] = asked["versions"]
 
     def _write(self) -> None:
-        self.path.mkdir(parents=True, exist_ok=True)
-        temporary = self.path / "run.yaml.tmp"
-        temporary.write_text(yaml.safe_dump(self.record, sort_keys=False, allow_unicode=True), encoding="utf-8")
-        os.replace(temporary, self.path / "run.yaml")
+        write_yaml(self.path / "run.yaml", self.record)
 
 
 def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -206,26 +200,6 @@ def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
             return file["positions"], file["times"]
     except (OSError, KeyError, ValueError) as error:
         raise InputError(f"{path} is not a rollout saved by masiv ({error})") from error
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Write ``data`` as strict JSON (numbers that are not finite become null) to a temporary name, then rename it."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False), encoding="utf-8")
-    os.replace(temporary, path)
-
-
-def plain(value: Any) -> Any:
-    """``value`` as JSON can hold it: numpy to lists, paths to text, numbers that are not finite to null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if isinstance(value, (str, int, bool, type(None))) else str(value)
 
 
 def _new_record(request: Request) -> dict[str, Any]:

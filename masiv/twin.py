@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 import yaml
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 from masiv.errors import InputError
+from masiv.files import write_safetensors, write_yaml
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
 
@@ -69,9 +70,8 @@ class Twin:
     def save(self, folder: Path) -> None:
         """Write twin.yaml, law.safetensors and particles.safetensors, each complete or not at all."""
         self.law.save(folder / "law.safetensors")
-        temporary = folder / "particles.tmp"
-        save_file({"positions": np.ascontiguousarray(self.positions, dtype=np.float32)}, temporary)
-        os.replace(temporary, folder / "particles.safetensors")
+        positions = torch.from_numpy(np.ascontiguousarray(self.positions, dtype=np.float32))
+        write_safetensors(folder / "particles.safetensors", {"positions": positions})
         ground = None
         if self.ground is not None:
             ground = {"normal": _floats(self.ground.normal), "height": _quantity(self.ground.height, "m")}
@@ -92,9 +92,7 @@ class Twin:
             "simulator": self.simulator.model_dump(),
             "fit": self.fit,
         }
-        temporary = folder / "twin.yaml.tmp"
-        temporary.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-        os.replace(temporary, folder / "twin.yaml")
+        write_yaml(folder / "twin.yaml", document)
 
     @classmethod
     def load(cls, folder: Path, name: str = "twin.yaml") -> Twin:

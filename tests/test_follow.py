@@ -9,12 +9,12 @@ import torch
 from test_reconstruct import FPS, SIDE, ball, camera_at
 
 from masiv.checkpoint import Checkpoint
-from masiv.cli import stages
 from masiv.config import Config
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.extend import extend_trajectory
 from masiv.continuum.trajectory import Trajectory, carry
 from masiv.errors import InputError
+from masiv.pipeline import stages
 from masiv.runfolder import Request, RunFolder
 from masiv.scene.scene import Frame, Scene
 from masiv.splat._reference import _render
@@ -172,13 +172,13 @@ def test_a_run_measures_its_held_out_frames_once(scene, fitted, particles, tmp_p
         request = Request(settings.model_dump(mode="json"), tmp_path, {}, fit_frames, (HIDDEN_VIEW,))
         return RunFolder.create_or_resume(tmp_path / name, request)
 
-    assert stages.held_out_trajectory(run_of("all", FRAMES), settings, visible, lambda *_: None) is None
+    assert stages.ensure_held_out_trajectory(run_of("all", FRAMES), settings, visible, lambda *_: None) is None
     run = run_of("part", KNOWN)
     for stage in ("reconstruct", "trajectory"):
         with run.stage(stage):
             fitted.save(run.path)
             particles.save(run.trajectory)
-    first = stages.held_out_trajectory(run, settings, visible, lambda *_: None)
+    first = stages.ensure_held_out_trajectory(run, settings, visible, lambda *_: None)
     assert first is not None
     assert len(first.positions) == FRAMES
     np.testing.assert_array_equal(first.positions[:KNOWN], particles.positions)
@@ -189,6 +189,6 @@ def test_a_run_measures_its_held_out_frames_once(scene, fitted, particles, tmp_p
     def work(*_):
         raise AssertionError("made again")
 
-    again = stages.held_out_trajectory(run, settings, visible, work)
+    again = stages.ensure_held_out_trajectory(run, settings, visible, work)
     assert again is not None
     np.testing.assert_array_equal(again.positions, first.positions)

@@ -13,11 +13,11 @@ from test_workers import small_simulation
 
 from masiv.errors import MasivError
 from masiv.inference.discretization import with_grid_errors, with_residual_std
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, best_strength, column, gauss_newton_jump, strengths_alone
 from masiv.models.base import EffectTerm, WeightedResidual
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import Model, Simulation
+from masiv.models.parameters import Parameter
 from masiv.refine import second_effect
 from masiv.refine.add_effect import absent
 from masiv.refine.candidates import score
@@ -392,3 +392,20 @@ def test_an_effect_that_sets_in_late_is_ranked_by_what_it_does_when_it_has():
     (found,) = score(Kinked(), base, robust_scale=1e6, names=["slide"])
     assert found.explained == pytest.approx(1.0, abs=1e-6)
     assert 3.0 < found.theta["a"] < 9.0
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_copy_with_other_observations_leaves_the_simulation_as_it_was():
+    simulation, _ = small_simulation()
+    model = Model(FAMILIES["neo_hookean"], "sticky")
+    values = {p.name: p.start for p in simulation.parameters(model)}
+    residual = simulation.residual(model, values)
+    (observation,) = simulation.observations
+    copy = simulation.with_observations([replace(observation, residual_std=2 * observation.residual_std)])
+    rolled = simulation.rollouts
+    np.testing.assert_allclose(copy.residual(model, values), 0.5 * residual)
+    assert copy.rollouts == simulation.rollouts == rolled  # the rollout was known
+    copy.residual(model, {**values, "youngs_modulus": 1.1 * values["youngs_modulus"]})
+    assert copy.rollouts == simulation.rollouts == rolled + 1
+    assert simulation.observations == (observation,)
+    np.testing.assert_array_equal(simulation.residual(model, values), residual)

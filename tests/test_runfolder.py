@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import math
-
 import numpy as np
 import pytest
 import yaml
 
 from masiv.config import load_config
 from masiv.errors import InputError, MasivError
-from masiv.runfolder import Request, RunFolder, load_motion, write_json
+from masiv.runfolder import Request, RunFolder, load_motion
 
 SCENE = {"fps": 24.0, "frames": 16, "gravity_m_s2": [0.0, -9.8, 0.0], "cameras_sha256": "ab"}
 
@@ -120,7 +117,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
         RunFolder.open(tmp_path)
 
 
-def test_motion_and_json_round_trip(tmp_path):
+def test_motion_round_trip(tmp_path):
     positions = np.random.default_rng(0).random((3, 5, 3)).astype(np.float32)
     np.savez(tmp_path / "rollout.npz", positions=positions, times=np.arange(3) / 24)
     again, times = load_motion(tmp_path / "rollout.npz")
@@ -128,5 +125,3 @@ def test_motion_and_json_round_trip(tmp_path):
     np.testing.assert_array_equal(times, np.arange(3) / 24)
     with pytest.raises(InputError, match="not a rollout"):
         load_motion(tmp_path / "nothing.npz")
-    write_json(tmp_path / "a.json", {"psnr": math.inf, "n": np.float32(2), "v": np.arange(2), "p": tmp_path})
-    assert json.loads((tmp_path / "a.json").read_text()) == {"psnr": None, "n": 2, "v": [0, 1], "p": str(tmp_path)}

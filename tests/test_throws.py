@@ -21,8 +21,8 @@ from test_identify import (  # noqa: F401  (fixtures)
     settings,
 )
 
-from cli.main import run
 from masiv.checkpoint import Checkpoint
+from masiv.cli.main import run
 from masiv.errors import InputError
 from masiv.identify.descent import Descent
 from masiv.identify.fit import fit

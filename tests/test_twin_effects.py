@@ -14,21 +14,23 @@ import torch
 import yaml
 from tiny_scenes import springgaus_synthetic
 
-from masiv.cli import main, stages
+from masiv.cli import main
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState, rigid_initial_state
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.simulator import Simulator
+from masiv.pipeline import Overrides, open_run
 from masiv.report.page import Page
 from masiv.report.report import _effects_section
 from masiv.runfolder import STAGES
 from masiv.scene.scene import Ground, Scene
-from masiv.simulation.simulate import Push, march, rigid_initial_state, simulate
+from masiv.simulation.simulate import Push, march, simulate
 from masiv.simulation.twin_effects import active_effects, body_mass, lowered
 from masiv.simulation.variation import with_body_of, with_density, with_ground
 from masiv.twin import Twin, TwinEffect
@@ -300,7 +302,7 @@ def test_what_is_wrong_in_twin_yaml_is_named(tmp_path, entries, message):
 
 
 def test_the_command_leaves_effects_out(tmp_path, monkeypatch, capfd):
-    run, _, _ = stages.open_run(springgaus_synthetic(tmp_path / "scene"), tmp_path / "run", preset="quick")
+    run = open_run(springgaus_synthetic(tmp_path / "scene"), tmp_path / "run", Overrides("quick")).folder
     for stage in STAGES:
         with run.stage(stage):
             pass

@@ -12,6 +12,7 @@ import numpy as np
 from masiv.characterization import curves
 from masiv.characterization.excitation import Excited, Sensitivity, excited_range, sensitivities
 from masiv.characterization.families import Match, nearest_families
+from masiv.files import write_json
 from masiv.materials.law import Law
 from masiv.progress import Progress, silent
 from masiv.subsample import kd_tree_subset
@@ -60,7 +61,6 @@ class Material:
 
     def save(self, path: Path) -> None:
         """Write ``path`` (.json), complete or not at all."""
-        from masiv.runfolder import write_json
 
         write_json(path, self.as_data())
 

@@ -7,7 +7,6 @@ the particles, is fine-tuned until they fill every other frame. d(x, 0) = 0 by c
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +19,7 @@ from masiv.continuum.consistency import consistent_particles
 from masiv.continuum.fill import FilledVolume, density_field, even_points, fill_volume
 from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
+from masiv.files import write_npz
 from masiv.hull.carve import visual_hull
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
@@ -53,10 +53,8 @@ class Trajectory:
     def save(self, path: Path) -> None:
         """Write ``path`` (.npz): positions, times, spacing, volume and the network; complete or not at all."""
         weights = {f"network/{name}": value.detach().numpy() for name, value in self.network.state_dict().items()}
-        temporary = path.with_suffix(".tmp.npz")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(
-            temporary,
+        write_npz(
+            path,
             positions=self.positions,
             times=self.times,
             spacing=self.spacing,
@@ -64,7 +62,6 @@ class Trajectory:
             network_settings=json.dumps(self.network.settings),
             **weights,
         )
-        os.replace(temporary, path)
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:

@@ -18,26 +18,12 @@ from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.misfit import Misfit
 from masiv.identify.objective import objective
 from masiv.inference.correlation import effective_samples
-from masiv.inference.least_squares import (
-    FIRST_STEP,
-    Estimate,
-    Parameter,
-    covariance,
-    fit_parameters,
-    robust_cost,
-    robust_weight,
-)
+from masiv.inference.least_squares import FIRST_STEP, Estimate, covariance, fit_parameters, robust_cost, robust_weight
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.families import (
-    FAMILIES,
-    Family,
-    Rollouts,
-    initial_state_from,
-    initial_state_parameters,
-    law_of,
-    mean_distance,
-)
-from masiv.models.problem import InitialState, Problem
+from masiv.models.families import FAMILIES, Family, Rollouts, law_of, mean_distance
+from masiv.models.initial_state import InitialState, initial_state_parameters
+from masiv.models.parameters import Parameter
+from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 RECONSIDERED = 3
@@ -75,7 +61,7 @@ class FamilyFit:
 
     @property
     def motion(self) -> InitialState:
-        return initial_state_from(self.values)
+        return InitialState.of_values(self.values)
 
     def state(self) -> dict[str, Any]:
         """Plain values, as a checkpoint keeps them."""
@@ -89,7 +75,7 @@ def search(problem: Problem, family: Family, motion: InitialState, progress: Pro
     contacts = ["sticky", "release"] if problem.config.contact == "auto" else [problem.config.contact]
     if problem.scene.ground is None:
         contacts = ["none"]
-    throw = {p.name: p.start for p in initial_state_parameters(problem, motion)}
+    throw = {p.name: p.start for p in initial_state_parameters(motion, problem.ground_range)}
     candidates = family.candidates()
     extra = (len(contacts) - 1) * min(RECONSIDERED, len(candidates))
     found: list[tuple[float, int, str, float]] = []
@@ -222,11 +208,11 @@ def fit_all_particles(
     parameters = _parameters(coarse, family, found)
     progress(label, 0, total)
     on_few = Misfit(coarse, family, found.contact, coarse.frames, pictures=pictures)
-    coarse = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
+    chord = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
     progress(label, 1, total)
     misfit = Misfit(problem, family, found.contact, problem.frames, pictures=pictures, chosen=coarse.chosen)
-    softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(coarse.residual))), 1e-12)
-    values, jacobian, scale = found.values, coarse.jacobian, 1.0
+    softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(chord.residual))), 1e-12)
+    values, jacobian, scale = found.values, chord.jacobian, 1.0
     best, residual = misfit(values)
     progress(label, 2, total, f"{1e3 * mean_distance(best):.1f} mm")
     for step in range(CHORD_STEPS):
@@ -247,7 +233,7 @@ def fit_all_particles(
         progress(label, 3 + step, total, f"{1e3 * mean_distance(best):.1f} mm")
     weight = robust_weight(residual, softness)
     spread = covariance(jacobian * weight[:, None], residual * weight)
-    estimate = Estimate(values, spread, jacobian, residual, coarse.evaluations + CHORD_STEPS + 1, tuple(parameters))
+    estimate = Estimate(values, spread, jacobian, residual, chord.evaluations + CHORD_STEPS + 1, tuple(parameters))
     found = _updated(coarse, found, _of_paths(estimate, misfit), 4)
     found.error_m = mean_distance(best)
     keep(checkpoint, found, f"{found.kind}, {ALL}")
@@ -277,7 +263,7 @@ def ranked(fits: list[FamilyFit]) -> list[FamilyFit]:
 
 
 def _parameters(problem: Problem, family: Family, found: FamilyFit) -> list[Parameter]:
-    both = [*family.parameters, *initial_state_parameters(problem, found.motion)]
+    both = [*family.parameters, *initial_state_parameters(found.motion, problem.ground_range)]
     return [replace(p, start=float(np.clip(found.values[p.name], p.lower, p.upper))) for p in both]
 
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from masiv.files import write_safetensors
+
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
     from masiv.kernels.substep import SubstepKernels
@@ -111,8 +113,4 @@ class Law(torch.nn.Module, ABC):
 
     def save(self, path: Path) -> None:
         """Write the weights as safetensors, complete or not at all. ``masiv.materials.load.load_law`` reads them."""
-        from safetensors.torch import save_file
-
-        temporary = path.with_suffix(".tmp")
-        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, temporary, metadata=self.file_metadata())
-        temporary.replace(path)
+        write_safetensors(path, self.state_dict(), self.file_metadata())

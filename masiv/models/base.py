@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
-from masiv.inference.least_squares import Parameter
+from masiv.models.parameters import Parameter
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from masiv.inference.model_fit import ModelFit
     from masiv.models.free_body import Model
     from masiv.refine.config import RefineConfig
+
+
+Self = TypeVar("Self")
 
 
 @dataclass(frozen=True)
@@ -129,12 +133,41 @@ class WholeRunSplit(WeightedResidual):
         return not self.fitted
 
 
+class SharedRollouts:
+    """A part of ``ForwardModel``: copies with other observations, which count their rollouts together."""
+
+    observations: Sequence[Any]
+
+    def __init__(self) -> None:
+        self._rollouts = [0]
+
+    @property
+    def rollouts(self) -> int:
+        """Rollouts so far, of this simulation and its copies."""
+        return self._rollouts[0]
+
+    @rollouts.setter
+    def rollouts(self, count: int) -> None:
+        self._rollouts[0] = count
+
+    def with_observations(self: Self, observations: Sequence[Any]) -> Self:
+        """See ``ForwardModel``."""
+        out = copy.copy(self)
+        out.observations = tuple(observations)
+        return out
+
+
 class ForwardModel(Protocol):
     """Residuals of models over experiments, and the parameters of a model."""
 
     rollouts: int
     observations: Sequence[Any]
-    """Of ``Observation``; the loop replaces them by the same with another sigma."""
+    """Of ``Observation``."""
+
+    def with_observations(self: Self, observations: Sequence[Any]) -> Self:
+        """A copy that compares with ``observations`` (the same, with another noise model or grid changes). It shares
+        caches, held substeps and the count of rollouts with this one, which keeps its own observations."""
+        ...
 
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
         """Everything that is fitted: law, effects, and the start of each experiment."""

@@ -13,10 +13,11 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.effect import ContactEffect
 from masiv.errors import InputError, MasivError, NonFiniteError
-from masiv.inference.least_squares import Parameter
-from masiv.models.base import EffectTerm, WeightedResidual, effect_parameters, plain_term
-from masiv.models.families import Family, initial_state_from, initial_state_parameters, law_of
-from masiv.models.problem import InitialState, Problem
+from masiv.models.base import EffectTerm, SharedRollouts, WeightedResidual, effect_parameters, plain_term
+from masiv.models.families import Family, law_of
+from masiv.models.initial_state import InitialState, initial_state_parameters
+from masiv.models.parameters import Parameter
+from masiv.models.problem import Problem
 
 if TYPE_CHECKING:
     from masiv.inference.model_fit import ModelFit
@@ -93,7 +94,7 @@ def parameters(model: Model, observations: Sequence[VideoObservation]) -> tuple[
     own = [
         replace(p, name=f"{p.name}@{e.name}")
         for e in observations
-        for p in initial_state_parameters(e.problem, e.motion)
+        for p in initial_state_parameters(e.motion, e.problem.ground_range)
         if p.name not in gone
     ]
     grids = [Parameter(f"{GRID_CHANGE}@{e.name}", 0.0, -1.0, 3.0, 0.25) for e in observations if e.grid_changes]
@@ -104,7 +105,7 @@ def parameters(model: Model, observations: Sequence[VideoObservation]) -> tuple[
 def initial_state_of(values: Mapping[str, float], observation: VideoObservation) -> InitialState:
     """The throw of ``observation`` among ``values``."""
     suffix = f"@{observation.name}"
-    return initial_state_from({n.removesuffix(suffix): v for n, v in values.items() if n.endswith(suffix)})
+    return InitialState.of_values({n.removesuffix(suffix): v for n, v in values.items() if n.endswith(suffix)})
 
 
 def active(model: Model, values: Mapping[str, float], problem: Problem) -> ActiveEffects | None:
@@ -137,7 +138,7 @@ def _run(
     return problem.run(law, throw, model.contact, frames, steps, active(model, values, problem))
 
 
-class Simulation:
+class Simulation(SharedRollouts):
     """Residuals of models. The number of substeps is held for a family, as in ``masiv.models.families``."""
 
     STABLE = 1.4
@@ -147,7 +148,7 @@ class Simulation:
     ) -> None:
         self.observations = tuple(observations)
         self.steps = {} if steps is None else steps
-        self.rollouts = 0
+        super().__init__()
         self.last: dict[int, tuple[tuple, torch.Tensor]] = {}
 
     def settle(self, model: Model, values: Mapping[str, float]) -> None:
@@ -181,7 +182,7 @@ class Simulation:
         throws = {
             f"{p.name}@{e.name}": p.start
             for e in self.observations
-            for p in initial_state_parameters(e.problem, e.motion)
+            for p in initial_state_parameters(e.motion, e.problem.ground_range)
         }
         return {name: throws.get(name, value) for name, value in values.items()}
 

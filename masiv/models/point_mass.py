@@ -19,12 +19,12 @@ from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.effect import Effect, NodalEffect
 from masiv.effects.per_body import DragBody
 from masiv.errors import InputError, NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, rms_mm
 from masiv.kernels.points import point_kernels
-from masiv.models.base import EffectTerm, WholeRunSplit, plain_term
+from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit, plain_term
 from masiv.models.families import Family
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 from masiv.refine.config import RefineConfig
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import Geometry
@@ -133,7 +133,7 @@ def mean_diameter(geometry: Geometry) -> float:
     return math.sqrt(surface / math.pi)
 
 
-class PointSimulation:
+class PointSimulation(SharedRollouts):
     """Mass points of a group under gravity and effects. See ``masiv.models.base.Simulated``."""
 
     def __init__(
@@ -148,7 +148,7 @@ class PointSimulation:
         self.gravity = self.frame.vectors_to_simulation(tracks.gravity)
         self.bodies = tuple(dict.fromkeys(run.body for run in self.observations))
         self.substep = substep
-        self.rollouts = 0
+        super().__init__()
         self.terms: dict[str, EffectTerm] = {}
 
     # -- models -------------------------------------------------------------------------------------------------

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
+from masiv.files import write_npz
 from masiv.inference.model_fit import ModelFit, rms_mm, split
 from masiv.models.base import EffectTerm
 from masiv.models.clamped_body import BodyRun
@@ -237,9 +237,7 @@ def save_fields(path: Path, found: Found) -> None:
         arrays[f"observed@{run.name}"] = observed
         arrays[f"before@{run.name}"] = observed + before
         arrays[f"after@{run.name}"] = observed + after
-    temporary = path.with_suffix(".tmp.npz")
-    np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
-    os.replace(temporary, path)
+    write_npz(path, **arrays)
 
 
 def observed_of(run: BodyRun | PointRun) -> np.ndarray:

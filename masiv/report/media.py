@@ -1,8 +1,7 @@
-"""Pictures and videos on disk, written to a temporary name and then renamed. Pictures are (H, W, 3) uint8 RGB."""
+"""Pictures and videos on disk, written completely or not at all. Pictures are (H, W, 3) uint8 RGB."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 
 from masiv.errors import MasivError
+from masiv.files import atomic, write_bytes
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
@@ -17,39 +17,37 @@ def write_png(path: Path, image: np.ndarray) -> None:
     encoded, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
     if not encoded:
         raise MasivError(f"the picture {path} could not be encoded")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(data.tobytes())
-    os.replace(temporary, path)
+    write_bytes(path, data.tobytes())
 
 
 def write_video(path: Path, images: Iterable[np.ndarray], fps: float, repeat: int = 1) -> None:
     """Write an H.264 mp4 that every browser plays. ``repeat`` shows each picture that many times, to slow it down."""
     import imageio_ffmpeg
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.stem + ".tmp.mp4")
-    writer = None
-    for image in images:
-        even = _even(image)
+    with atomic(path) as temporary:
+        writer = None
+        try:
+            for image in images:
+                even = _even(image)
+                if writer is None:
+                    size = even.shape[1], even.shape[0]
+                    writer = imageio_ffmpeg.write_frames(
+                        str(temporary),
+                        size,
+                        fps=fps,  # pyright: ignore[reportArgumentType] a fraction is fine for ffmpeg
+                        quality=8,
+                        macro_block_size=2,
+                        pix_fmt_out="yuv420p",
+                        ffmpeg_log_level="error",
+                    )
+                    writer.send(None)
+                for _ in range(repeat):
+                    writer.send(even.tobytes())
+        finally:
+            if writer is not None:
+                writer.close()
         if writer is None:
-            size = even.shape[1], even.shape[0]
-            writer = imageio_ffmpeg.write_frames(
-                str(temporary),
-                size,
-                fps=fps,  # pyright: ignore[reportArgumentType] a fraction is fine for ffmpeg
-                quality=8,
-                macro_block_size=2,
-                pix_fmt_out="yuv420p",
-                ffmpeg_log_level="error",
-            )
-            writer.send(None)
-        for _ in range(repeat):
-            writer.send(even.tobytes())
-    if writer is None:
-        raise MasivError(f"there is no picture to make the video {path} of")
-    writer.close()
-    os.replace(temporary, path)
+            raise MasivError(f"there is no picture to make the video {path} of")
 
 
 def _even(image: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -185,3 +185,27 @@ def _span(indices: list[int] | None) -> str | None:
         else:
             runs.append([index])
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
+
+
+def law_text(law: Mapping[str, Any], families: Sequence[Mapping[str, Any]]) -> str:
+    """A law's parameters with their standard errors, and the error of each family if several were fitted."""
+    lines = [f"law      {law['kind']}"]
+    for name, entry in law["parameters"].items():
+        line = f"         {name.replace('_', ' ')} {entry['value']:.4g} {entry['unit']}"
+        if "stderr" in entry:
+            known = entry["stderr"] is not None
+            line += f" ± {entry['stderr']:.2g}" if known else " (the motion does not determine it)"
+        lines.append(line)
+    for row in families:
+        if "failed" in row:
+            lines.append(f"         {row['law']}: failed, {row['failed']}")
+            continue
+        pictures = row["picture_error"]
+        rank = f"BIC {row['bic_above_best']:.0f} above the best" if pictures is None else f"pictures {pictures:.3f}"
+        lines.append(f"         {row['law']}: {row['trajectory_error_mm']:.1f} mm from the paths, {rank}")
+    return "\n".join(lines) + "\n"
+
+
+def given_or_error(stderr: float | None) -> str:
+    """A standard error for a terminal; a value without one was given, not fitted."""
+    return " (given)" if stderr is None else f" ± {stderr:.2g}"

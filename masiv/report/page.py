@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 import html
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from masiv.files import write_text
 
 STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:1100px;margin:2rem auto;padding:0 1rem;color:#1c2430;background:#fff}
@@ -60,16 +61,14 @@ class Page:
         self.note(caption)
 
     def write(self, path: Path) -> None:
-        """Write the page to a temporary name, then rename it."""
+        """Write the page, completely or not at all."""
         title = html.escape(self.title)
         text = (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width,initial-scale=1">'
             f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>{''.join(self.parts)}</body></html>"
         )
-        temporary = path.with_name(path.name + ".tmp")
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
+        write_text(path, text)
 
 
 def number(value: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import torch
 
 from masiv.config import Config
 from masiv.errors import InputError
+from masiv.files import write_npz
 from masiv.models.clamped_body import BodySimulation
 from masiv.models.point_mass import PointRun, PointSimulation
 from masiv.mpm.rollout import rollout
@@ -91,8 +91,5 @@ def _result(positions: np.ndarray, markers: np.ndarray, times: np.ndarray, names
 
 def save_rollout(folder: Path, arrays: dict[str, np.ndarray]) -> Path:
     """rollout.npz, complete or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = folder / "rollout.tmp.npz"
-    np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
-    os.replace(temporary, folder / "rollout.npz")
+    write_npz(folder / "rollout.npz", **arrays)
     return folder / "rollout.npz"

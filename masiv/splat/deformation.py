@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from masiv.errors import InputError
+from masiv.files import write_safetensors
 
 
 class DeformationNetwork(torch.nn.Module):
@@ -131,12 +130,8 @@ class DeformationNetwork(torch.nn.Module):
         return a * knots[left] + b * knots[left + 1] + curve
 
     def save(self, path: Path) -> None:
-        """Write the network to ``path`` (safetensors; the settings are in its metadata), through a temporary name."""
-        path = Path(path)
-        temporary = path.with_name(path.name + ".tmp")
-        tensors = {name: value.detach().contiguous().cpu() for name, value in self.state_dict().items()}
-        save_file(tensors, temporary, metadata={"masiv_deformation": json.dumps(self.settings)})
-        os.replace(temporary, path)
+        """Write the network to ``path`` (safetensors; the settings are in its metadata)."""
+        write_safetensors(path, self.state_dict(), {"masiv_deformation": json.dumps(self.settings)})
 
     @classmethod
     def load(cls, path: Path) -> DeformationNetwork:

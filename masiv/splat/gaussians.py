@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from masiv.errors import InputError, MasivError
+from masiv.files import atomic
 
 _SH_DEGREE_0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 1/2 + _SH_DEGREE_0 f_dc."""
@@ -52,10 +52,8 @@ class Gaussians:
             if not np.isfinite(column).all():
                 raise MasivError(f"{path} is not written: a Gaussian's {name} is not finite")
             rows[name] = column
-        path = Path(path)
-        temporary = path.with_name(path.name + ".tmp")
-        PlyData([PlyElement.describe(rows, "vertex")]).write(str(temporary))
-        os.replace(temporary, path)
+        with atomic(path) as temporary:
+            PlyData([PlyElement.describe(rows, "vertex")]).write(str(temporary))
 
     @classmethod
     def load_ply(cls, path: Path) -> Gaussians:

@@ -31,7 +31,8 @@ def synthesise(spec: SynthSpec, out: Path, *, progress: Progress = silent) -> No
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} holds something already: give --out a new folder")
     draft = out.with_name(out.name + ".tmp")
-    shutil.rmtree(draft, ignore_errors=True)
+    if draft.exists():
+        shutil.rmtree(draft)
     (draft / "data").mkdir(parents=True)
     (draft / "gt").mkdir()
     progress("simulate", 0, 1)

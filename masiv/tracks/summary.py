@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from masiv.files import atomic
 from masiv.tracks.tracks import Run, Tracks
 
 _PATHS = 3000
@@ -184,11 +184,9 @@ def write_tracks_picture(tracks: Tracks, path: Path) -> None:
             panels[2].axvline(run.release, lw=0.5, color="0.6")
     panels[2].set(xlabel="time [s]", ylabel="farthest marker from rest [mm]", title="all runs")
     panels[2].legend(fontsize=6)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp.png")
-    figure.savefig(temporary, dpi=110)
+    with atomic(path) as temporary:
+        figure.savefig(temporary, dpi=110)
     plt.close(figure)
-    os.replace(temporary, path)
 
 
 def _views(up: np.ndarray) -> list[tuple[int, int]]:

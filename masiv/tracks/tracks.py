@@ -47,8 +47,8 @@ class Run:
 
     positions (T, M, 3), NaN where nothing was measured; times (T,) as in the file, increasing; rate [Hz]; purpose: fit
     or hold_out; rest: frames at rest before the release; at_rest (M, 3): where markers are then (in the first frame
-    that shows them, without rest frames), NaN for what was not measured; noise_std (M, 3): standard deviation of each axis
-    at rest (None: without two rest frames); release [s]: when the body is let go (None: not known); placement: the
+    that shows them, without rest frames), NaN for what was not measured; noise_std (M, 3): standard deviation of each
+    axis at rest (None: without two rest frames); release [s]: when the body is let go (None: not known); placement: the
     body's own axes -> world at rest (None: no geometry); unsteady [s]: how long after the release it is not compared.
     """
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
+from masiv.files import write_yaml
 from masiv.inference.model_fit import ModelFit
 from masiv.materials.classical import UNITS
 from masiv.models.base import EffectTerm
@@ -76,9 +74,7 @@ class TracksTwin:
             "starts": self.starts,
             "fit": self.fit,
         }
-        temporary = folder / f"{name}.tmp"
-        temporary.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-        os.replace(temporary, folder / name)
+        write_yaml(folder / name, document)
 
     @classmethod
     def load(cls, folder: Path, name: str = "twin.yaml") -> TracksTwin:

@@ -1,0 +1,110 @@
+"""A run: its folder, its settings and what was observed. One interface for every kind of observation."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar
+
+from masiv import runtime
+from masiv.config import Config, load_config
+from masiv.errors import InputError
+from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary
+from masiv.progress import Progress, silent
+from masiv.runfolder import RunFolder
+
+
+class Run(ABC):
+    """The stages of a run folder. A stage runs only if the folder lacks its artefacts; a killed one resumes.
+
+    Subclasses differ in what was observed: pictures (``masiv.pipeline.video``) or tracks (``masiv.pipeline.tracks``).
+    """
+
+    layouts: ClassVar[str]
+    """What the scenes of this kind are made of, for messages."""
+
+    def __init__(self, folder: RunFolder, config: Config) -> None:
+        self.folder = folder
+        self.config = config
+
+    @property
+    def path(self) -> Path:
+        return self.folder.path
+
+    def start(self) -> None:
+        """Start Taichi on the backend that the configuration names."""
+        runtime.start(self.config.arch)
+
+    @classmethod
+    @abstractmethod
+    def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> Run:
+        """The run in ``out``, new or resumed. Everything is checked before the folder is made. Raises InputError."""
+
+    def reconstruct(self, progress: Progress = silent) -> Summary:
+        """Dynamic Gaussians. Raises InputError if there are no pictures."""
+        raise InputError(f"{self.folder.scene_path} holds {self.layouts}: there is nothing to reconstruct, identify it")
+
+    def trajectory(self, progress: Progress = silent) -> Summary:
+        """The filled continuum and its motion. Raises InputError if there are no pictures."""
+        raise InputError(f"{self.folder.scene_path} holds {self.layouts}, which are trajectories: identify it")
+
+    @abstractmethod
+    def identify(self, progress: Progress = silent) -> Summary:
+        """Every stage that the run lacks; then rollout.npz, metrics.json and report.html."""
+
+    @abstractmethod
+    def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:
+        """Find the effects that the model lacks: refine.json, the new twin.yaml, the report."""
+
+    @abstractmethod
+    def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
+        """A rollout under other conditions: ``out``/rollout.npz, and pictures if asked for."""
+
+    @abstractmethod
+    def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
+        """Errors against ground truth or against held-out observations: evaluate.json."""
+
+
+def _kinds() -> dict[str, type[Run]]:
+    from masiv.pipeline.tracks import TracksRun
+    from masiv.pipeline.video import VideoRun
+
+    return {"tracks": TracksRun, "video": VideoRun}
+
+
+def open_run(
+    scene: Path, out: Path | None = None, overrides: Overrides | None = None, request: SceneRequest | None = None
+) -> Run:
+    """The run of ``scene`` in the folder ``out`` (runs/SCENE if None), new or resumed. Raises InputError."""
+    from masiv.tracks.read import recognises
+
+    kind = _kinds()["tracks" if scene.is_dir() and recognises(scene) else "video"]
+    folder = out or Path("runs") / scene.resolve().name
+    return kind.open(scene, folder, overrides or Overrides(), request or SceneRequest())
+
+
+def reopen_run(path: Path, overrides: Overrides | None = None, *, require: str | None = None) -> Run:
+    """The run in the folder ``path``. require: a stage that must be done. Raises InputError."""
+    folder = RunFolder.open(path)
+    kind = _kinds()["tracks" if folder.record["scene"].get("layout") == "tracks" else "video"]
+    run = kind.open(folder.scene_path, path, overrides or Overrides(), SceneRequest())
+    if require is not None:
+        run.folder.require(require)
+    return run
+
+
+def inspect_scene(scene: Path, picture: Path | None = None, overrides: Overrides | None = None) -> Summary:
+    """What is read of ``scene``, drawn to ``picture`` (SCENE_inspect.png in the current folder if None)."""
+    from masiv.observations.read import read_observation
+    from masiv.report.inspection import inspection
+
+    o = overrides or Overrides()
+    load_config(o.preset, o.config, seed=o.seed, arch=o.arch)
+    target = picture or Path(f"{scene.resolve().stem if scene.is_file() else scene.resolve().name}_inspect.png")
+    summary, text = inspection(read_observation(scene), target)
+    return Summary(summary, text)
+
+
+def settings(overrides: Overrides, base: dict[str, Any] | None, **flags: Any) -> Config:
+    """The configuration of a run: ``base`` of an existing one, under ``overrides``, under ``flags``."""
+    return load_config(overrides.preset, overrides.config, base, seed=overrides.seed, arch=overrides.arch, **flags)

@@ -1,0 +1,198 @@
+"""The stages of a run of pictures, each run if the folder lacks its artefacts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from masiv import runtime
+from masiv.config import Config
+from masiv.errors import InputError
+from masiv.observations.read import read_scene
+from masiv.progress import Progress, silent
+from masiv.report.history import logged
+from masiv.report.material import MATERIAL
+from masiv.runfolder import RunFolder
+from masiv.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from masiv.continuum.trajectory import Trajectory
+    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.twin import Twin
+
+
+def training_scene(run: RunFolder, scene: Scene) -> Scene:
+    """``scene`` without held-out frames and cameras: what a stage that fits may see."""
+    return scene.restricted(run.fit_frames, run.holdout_cameras)
+
+
+def load_gaussians(run: RunFolder) -> DynamicGaussians:
+    """The result of a finished reconstruct stage. Raises InputError."""
+    from masiv.splat.dynamic import DynamicGaussians
+
+    run.require("reconstruct")
+    return DynamicGaussians.load(run.path)
+
+
+def load_trajectory(run: RunFolder) -> Trajectory:
+    """The result of a finished trajectory stage. Raises InputError."""
+    from masiv.continuum.trajectory import Trajectory
+
+    run.require("trajectory")
+    return Trajectory.load(run.trajectory)
+
+
+def ensure_gaussians(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> DynamicGaussians:
+    """The run's dynamic Gaussians; reconstructs them if they are missing."""
+    runtime.start(config.arch)
+    if run.done("reconstruct"):
+        return load_gaussians(run)
+    from masiv.splat.reconstruct import reconstruct
+
+    with run.stage("reconstruct") as checkpoint:
+        dynamic = reconstruct(
+            training_scene(run, scene),
+            config.reconstruct,
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=logged(progress, run.log),
+        )
+        dynamic.save(run.path)
+    return dynamic
+
+
+def ensure_trajectory(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Trajectory:
+    """The run's trajectory; estimates it if it is missing."""
+    runtime.start(config.arch)
+    if run.done("trajectory"):
+        return load_trajectory(run)
+    from masiv.continuum.trajectory import estimate_trajectory
+
+    dynamic = ensure_gaussians(run, config, scene, progress)
+    with run.stage("trajectory") as checkpoint:
+        trajectory = estimate_trajectory(
+            training_scene(run, scene),
+            dynamic,
+            config.trajectory,
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=logged(progress, run.log),
+        )
+        trajectory.save(run.trajectory)
+    return trajectory
+
+
+def ensure_twin(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Twin:
+    """The run's twin; identifies it if it is missing."""
+    runtime.start(config.arch)
+    from masiv.identify.stage import identify
+    from masiv.twin import Twin
+
+    if run.done("identify"):
+        return Twin.load(run.path)
+    trajectory = ensure_trajectory(run, config, scene, progress)
+    with run.stage("identify") as checkpoint:
+        twin = identify(
+            training_scene(run, scene),
+            trajectory,
+            config.identify,
+            config.simulator,
+            others=other_recordings(config),
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=logged(progress, run.log),
+        )
+        (run.path / MATERIAL).unlink(missing_ok=True)  # of an earlier twin
+        twin.save(run.path)
+    return twin
+
+
+def other_recordings(config: Config) -> list[tuple[Scene, Trajectory]]:
+    """The other recordings of the same object that a law is learnt from, without their held-out frames and cameras."""
+    runs = [RunFolder.open(Path(path)) for path in config.identify.also]
+    return [(training_scene(run, read_scene(run.scene_path)), load_trajectory(run)) for run in runs]
+
+
+def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Trajectory | None:
+    """The run's particles through all frames of ``scene``, held-out frames included; None if none was held out.
+
+    Held-out frames are measured after every fit, and no fit sees them. Frames before ``run.fit_frames`` are those of
+    the run. Made once: RUN/held_out keeps it. Raises InputError if the run has no trajectory yet.
+    """
+    if run.fit_frames >= scene.frame_count:
+        return None
+    from masiv.continuum.extend import extend_trajectory
+    from masiv.continuum.trajectory import Trajectory
+    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.splat.follow import follow
+    from masiv.splat.follow_config import FollowConfig
+
+    folder = run.path / "held_out"
+    path = folder / "trajectory.npz"
+    if path.is_file():
+        return Trajectory.load(path)
+    runtime.start(config.arch)
+    given = load_trajectory(run)
+    visible = scene.restricted(holdout_cameras=run.holdout_cameras)
+    folder.mkdir(exist_ok=True)
+    checkpoint = run.checkpoint("held_out_gaussians")
+    if not (folder / "deformation.safetensors").is_file():
+        extended = follow(
+            visible,
+            load_gaussians(run),
+            config.reconstruct,
+            FollowConfig.model_validate({}),
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=progress,
+        )
+        extended.save(folder)
+    checkpoint.clear()
+    checkpoint = run.checkpoint("held_out_trajectory")
+    trajectory = extend_trajectory(
+        visible,
+        DynamicGaussians.load(folder),
+        given,
+        config.trajectory,
+        seed=config.seed,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+    trajectory.save(path)
+    checkpoint.clear()
+    return trajectory
+
+
+@contextmanager
+def material_description(run: RunFolder, config: Config, twin: Twin) -> Iterator[None]:
+    """Write material.json, if it is missing, in a second process while the body of this context runs."""
+    from masiv.workers import Workers, processes_wanted, unwrap
+
+    if (run.path / MATERIAL).is_file():
+        yield
+        return
+    with Workers(min(2, processes_wanted(config.identify.processes)), "identify.processes") as workers:
+        wait = workers.submit(describe_material, (run, twin))
+        yield
+        unwrap(wait())
+
+
+def describe_material(run: RunFolder, twin: Twin, progress: Progress = silent) -> None:
+    """Write material.json: the law of ``twin`` in a tester's terms."""
+    from masiv.characterization.describe import describe_twin
+
+    if "refined" in twin.fit:  # the numbers of the fit are of the law before: the error is measured
+        twin = replace(twin, fit={})
+    positions = load_trajectory(run).positions
+    describe_twin(twin, frames=run.fit_frames, trajectory=positions, progress=progress).save(run.path / MATERIAL)
+
+
+def require_run(path: Path, option: str) -> Path:
+    """``path`` if it is a run whose identify stage is done. Raises InputError that names ``option``."""
+    if not (path / "run.yaml").is_file():
+        raise InputError(f"{option} {path} is not a run folder: give one that masiv identify made")
+    RunFolder.open(path).require("identify")
+    return path

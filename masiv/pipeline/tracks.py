@@ -1,0 +1,258 @@
+"""A run of a scene of tracks: measured points in place of pictures, so that there is nothing to reconstruct."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from masiv.config import Config
+from masiv.errors import InputError
+from masiv.files import write_json
+from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
+from masiv.pipeline.run import Run, settings
+from masiv.progress import Progress, silent
+from masiv.runfolder import Request, RunFolder
+from masiv.strict import read_yaml
+from masiv.tracks.read import read_tracks
+from masiv.tracks.summary import identity
+from masiv.tracks.tracks import Tracks
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from masiv.tracks.twin import TracksTwin
+
+BEFORE = "twin.before.yaml"
+NOT_FOR_TRACKS = (
+    *("velocity", "omega", "law", "blend", "geometry", "density", "ground"),
+    *("force", "force_from", "force_until", "render", "view"),
+)
+"""Fields of ``SimulateRequest`` that apply to a filmed body alone."""
+
+
+class TracksRun(Run):
+    """See ``masiv.pipeline.run.Run``."""
+
+    layouts = "tracks"
+
+    def __init__(self, folder: RunFolder, config: Config, tracks: Tracks) -> None:
+        super().__init__(folder, config)
+        self.tracks = tracks
+
+    @classmethod
+    def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> TracksRun:
+        """As ``Run.open``. The law is ``auto`` if none is named, since markers cannot teach a neural one."""
+        refuse(request, ("fit_frames", "holdout_camera", "geometry_loss", "no_silhouette", "also"), "pictures", scene)
+        existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
+        file = overrides.config
+        named = file is not None and "law" in (read_yaml(file).get("identify") or {})
+        law = request.identify.get("law")
+        if law is None and existing is None and not named:
+            law = "auto"
+        config = settings(overrides, existing.config if existing else None, **{"identify.law": law})
+        if config.identify.law in ("neural", "adapter"):
+            raise InputError(
+                f"--law {config.identify.law} needs the motion of a whole body, and markers show a few points of it: "
+                "use --law auto or a classical law"
+            )
+        tracks = read_tracks(scene)
+        asked = Request(config.model_dump(mode="json"), scene, identity(tracks), 0)
+        return cls(RunFolder.create_or_resume(out, asked), config, tracks)
+
+    def identify(self, progress: Progress = silent) -> Summary:
+        self.start()
+        from masiv.refine.tracks_stage import identify_tracks
+        from masiv.report.numbers import given_or_error
+        from masiv.tracks.twin import TracksTwin
+
+        families: list[dict[str, Any]] = []
+        if self.folder.done("identify"):
+            twin = TracksTwin.load(self.path)
+        else:
+            with self.folder.stage("identify"):
+                twin, fits = identify_tracks(self.tracks, self.config, folder=self._rollout_cache, progress=progress)
+                families = [
+                    {"law": f.model.family.kind, "fit_rmse_mm": f.fit_mm, "held_out_rmse_mm": f.held_out_mm}
+                    for f in fits
+                ]
+                twin.save(self.path)
+        rows = self._report(twin, progress)
+        law = {
+            "kind": twin.law,
+            "parameters": {n: {"value": v, "unit": u, "stderr": e} for n, (v, u, e) in twin.parameters.items()},
+        }
+        data = {
+            "run": str(self.path), "report": str(self.folder.report), "law": law, "families": families, "runs": rows
+        }  # fmt: skip
+        lines = [f"law      {twin.law}"]
+        for name, (value, unit, error) in twin.parameters.items():
+            lines.append(f"         {name.replace('_', ' ')} {value:.4g} {unit}" + given_or_error(error))
+        return Summary(data, "\n".join([*lines, *_table(rows), f"report   {self.folder.report}"]))
+
+    def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:
+        refuse(request, ("second_run", "relearn"), "pictures", self.folder.scene_path)
+        self.folder.require("identify")
+        self.start()
+        from masiv.refine.summary import ADDED, text
+        from masiv.refine.tracks_document import document, named, save_fields
+        from masiv.refine.tracks_stage import refine_tracks, twin_after
+
+        first = self._conditions[0]
+        twin = self._twin_without(request.condition or first)
+        if request.group and twin.group is None:
+            raise InputError(f"{self.path} is of one body: --group is for bodies that fly free and share physics")
+        result = refine_tracks(
+            self.tracks, twin, self.config, condition=request.condition, dry_run=request.dry_run,
+            folder=self._rollout_cache, progress=progress,
+        )  # fmt: skip
+        written = document(result, self.config.refine, dry_run=request.dry_run)
+        stem = refine_stem(request.condition, first)
+        if request.dry_run:
+            write_json(self.path / f"{stem}.dry_run.json", written)
+        else:
+            write_json(self.path / f"{stem}.json", written)
+            save_fields(self.path / f"{stem}.npz", result)
+            if written["verdict"] == ADDED:
+                self._keep_identified_twin()
+                twin = twin_after(twin, result)
+            twin.save(self.path)
+            self._report(twin, progress)
+        if self._rollout_cache.is_dir():
+            shutil.rmtree(self._rollout_cache)
+        lines = [text(named(written))]
+        for body, row in written["bodies"].items():
+            held = row["held_out_mm"]
+            what = ", ".join(row["effects"]) or row["verdict"]
+            lines.append(f"  {body:24s} {what:28s} held out {held['before']:.0f} -> {held['after']:.0f} mm")
+        for row in written["shared"]:
+            lines.append(
+                f"one {row['parameter'].replace('_', ' ')} for {', '.join(row['bodies'])}: {row['value']:.3g} ± "
+                f"{row['stderr']:.2g} {row['unit']}, {row['spread_between_bodies']:.2g} between them"
+            )
+        return Summary({"refine": str(self.path / f"{stem}.json"), **written}, "\n".join(lines))
+
+    def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
+        refuse(request, NOT_FOR_TRACKS, "pictures", self.folder.scene_path)
+        self.folder.require("identify")
+        self.start()
+        from masiv.simulation.tracks import save_rollout, simulate_tracks
+        from masiv.tracks.twin import TracksTwin
+
+        twin = TracksTwin.load(self.path)
+        arrays = simulate_tracks(
+            self.tracks, twin, self.config, frames=request.frames, gravity=request.gravity, without=request.without,
+            condition=request.condition,
+        )  # fmt: skip
+        path = save_rollout(out, arrays)
+        data = {
+            "rollout": str(path),
+            "frames": request.frames,
+            "particles": arrays["positions"].shape[1],
+            "markers": arrays["marker_names"].tolist(),
+            "effects": [e.effect for e in twin.effects if e.effect not in request.without],
+        }
+        return Summary(data, str(path))
+
+    def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
+        """Errors of every run, fitted and held out apart, before and after refine: evaluate.json."""
+        if truth is not None:
+            raise InputError(f"--truth is for scenes of pictures: leave it out for {self.folder.scene_path}")
+        self.folder.require("identify")
+        self.start()
+        from masiv.tracks.twin import TracksTwin
+
+        rows = self._report(TracksTwin.load(self.path), progress)
+        numbers = {
+            "fit": [r for r in rows if r["use"] == "fit"],
+            "held_out": [r for r in rows if r["use"] == "hold_out"],
+            "unit": "mm",
+        }
+        write_json(self.folder.evaluation, numbers)
+        data = {"evaluation": str(self.folder.evaluation), **numbers}
+        return Summary(data, "\n".join([*_table(rows), str(self.folder.evaluation)]))
+
+    @property
+    def _rollout_cache(self) -> Path:
+        """Rollouts of a stage that is not finished."""
+        return self.path / "checkpoints" / "rollouts"
+
+    @property
+    def _conditions(self) -> list[str]:
+        return list(dict.fromkeys(run.condition for run in self.tracks.runs))
+
+    def _twin_without(self, condition: str) -> TracksTwin:
+        """The twin from which ``condition`` is refined: without what an earlier refine of it added. The first condition
+        begins with the law that identify found; effects of other conditions stay."""
+        from masiv.tracks.twin import TracksTwin
+
+        current = TracksTwin.load(self.path)
+        if condition != self._conditions[0]:
+            return replace(current, effects=tuple(e for e in current.effects if e.condition != condition))
+        identified = TracksTwin.load(self.path, BEFORE) if (self.path / BEFORE).is_file() else current
+        others = tuple(e for e in current.effects if e.condition is not None)
+        return replace(identified, effects=others, starts={**current.starts, **identified.starts})
+
+    def _keep_identified_twin(self) -> None:
+        """Keep twin.yaml as identify made it. A second refine keeps the first one's copy."""
+        if not (self.path / BEFORE).is_file():
+            shutil.copyfile(self.path / "twin.yaml", self.path / BEFORE)
+
+    def _report(self, twin: TracksTwin, progress: Progress) -> list[dict[str, Any]]:
+        """Simulate every run with the twin, and with the one before refine if there is one; metrics.json, rollout.npz,
+        report.html. Returns the errors of each run."""
+        from masiv.refine.tracks_document import named, observed_of
+        from masiv.refine.tracks_stage import run_errors, simulated
+        from masiv.report.tracks_page import write_page
+        from masiv.simulation.tracks import save_rollout
+        from masiv.tracks.twin import TracksTwin
+
+        twins = {"before": twin}
+        if (self.path / BEFORE).is_file():
+            twins = {"before": TracksTwin.load(self.path, BEFORE), "after": twin}
+        conditions: list[str | None] = [None] if twin.group is not None else list(self._conditions)
+        rows: dict[str, dict[str, Any]] = {}
+        curves: dict[str, dict[str, np.ndarray]] = {}
+        for done, condition in enumerate(conditions):
+            if condition is not None and not self.tracks.chosen(purpose="fit", condition=condition):
+                continue
+            for name, model in twins.items():
+                progress("report: simulate", done, len(conditions), name)
+                made = simulated(self.tracks, model, self.config, condition)
+                observations, fields = made.simulation.observations, made.fields()
+                for observation, field in zip(observations, fields, strict=True):
+                    observed = observed_of(observation)
+                    own = curves.setdefault(observation.name, {"times": observation.times, "observed": observed})
+                    own[name] = observed + field
+                for row in run_errors(observations, fields):
+                    error = row.pop("rmse_mm")
+                    rows.setdefault(row["run"], row)[f"{name}_mm"] = error
+        progress("report: simulate", len(conditions), len(conditions))
+        save_rollout(self.path, {f"{key}@{name}": value for name, own in curves.items() for key, value in own.items()})
+        errors = list(rows.values())
+        write_json(
+            self.folder.metrics, {"runs": errors, "unit": "mm", "what": "root mean square distance of the points"}
+        )
+        files = [self.path / f"{refine_stem(c, self._conditions[0])}.json" for c in self._conditions]
+        refined = [named(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
+        write_page(self.folder.report, self.tracks, twin, errors, curves, refined)
+        return errors
+
+
+def refine_stem(condition: str | None, first: str) -> str:
+    """Name of the files of ``refine`` without their extension: refine for the ``first`` condition (None: that one),
+    refine.CONDITION for another. A condition is any text: what no file name may hold is percent-encoded, so that no two
+    conditions share a file."""
+    return "refine" if condition is None or condition == first else f"refine.{quote(condition, safe=' ')}"
+
+
+def _table(rows: list[dict[str, Any]]) -> list[str]:
+    """Errors of runs for a terminal."""
+    out = []
+    for row in rows:
+        errors = ", ".join(f"{n.removesuffix('_mm')} {row[n]:.4g} mm" for n in ("before_mm", "after_mm") if n in row)
+        out.append(f"  {row['run']:28s} {row['use']:9s} {errors}")
+    return out

@@ -1,0 +1,190 @@
+"""A run of a scene of pictures: reconstruct -> trajectory -> identify -> refine, simulate, evaluate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from masiv.config import Config
+from masiv.errors import InputError
+from masiv.files import write_json
+from masiv.observations.read import read_scene
+from masiv.pipeline import stages
+from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
+from masiv.pipeline.run import Run, reopen_run, settings
+from masiv.progress import Progress, silent
+from masiv.runfolder import Request, RunFolder
+from masiv.scene.scene import Scene
+from masiv.scene.summary import identity
+
+
+class VideoRun(Run):
+    """See ``masiv.pipeline.run.Run``. scene: all frames and cameras; stages that fit see ``training_scene`` of it."""
+
+    layouts = "pictures"
+
+    def __init__(self, folder: RunFolder, config: Config, scene: Scene) -> None:
+        super().__init__(folder, config)
+        self.scene = scene
+
+    @classmethod
+    def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> VideoRun:
+        existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
+        flags = {f"identify.{key}": value for key, value in request.identify.items()}
+        config = settings(overrides, existing.config if existing else None, **flags)
+        read = read_scene(scene)
+        for other in config.identify.also:
+            config.identify.refuse_more_throws()
+            if Path(other).resolve() == out.resolve():
+                raise InputError(f"--also {other} is the run itself: give runs of other recordings of the same object")
+            RunFolder.open(Path(other)).require("trajectory")
+        fit_frames = request.fit_frames
+        if fit_frames is None:
+            fit_frames = existing.fit_frames if existing else read.fit_frames or read.frame_count
+        cameras = tuple(sorted(set(request.holdout_camera))) or (existing.holdout_cameras if existing else ())
+        read.restricted(fit_frames, cameras)
+        asked = Request(config.model_dump(mode="json"), scene, identity(read), fit_frames, cameras)
+        return cls(RunFolder.create_or_resume(out, asked), config, read)
+
+    def reconstruct(self, progress: Progress = silent) -> Summary:
+        dynamic = stages.ensure_gaussians(self.folder, self.config, self.scene, progress)
+        from masiv.report.numbers import reconstruction_numbers, table
+
+        numbers = reconstruction_numbers(self.folder, self.scene, dynamic)
+        data = {
+            "run": str(self.path),
+            "gaussians": len(dynamic.canonical),
+            "reconstruction": numbers,
+            "seconds": self.folder.seconds(),
+        }
+        text = f"{self.path}: {len(dynamic.canonical)} Gaussians\n{table({'reconstruction': numbers})}"
+        return Summary(data, text)
+
+    def trajectory(self, progress: Progress = silent) -> Summary:
+        made = stages.ensure_trajectory(self.folder, self.config, self.scene, progress)
+        frames, particles = made.positions.shape[:2]
+        data = {
+            "run": str(self.path),
+            "trajectory": str(self.folder.trajectory),
+            "frames": frames,
+            "particles": particles,
+            "spacing_m": made.spacing,
+            "volume_m3": made.volume,
+            "seconds": self.folder.seconds(),
+        }
+        text = f"{self.folder.trajectory}: {particles} particles, {frames} frames, {made.spacing * 1e3:.1f} mm apart"
+        return Summary(data, f"{text}, {made.volume * 1e3:.2f} litres")
+
+    def identify(self, progress: Progress = silent) -> Summary:
+        self.start()
+        from masiv.report.numbers import law_text, material_numbers, run_numbers, table
+        from masiv.report.report import write_report
+        from masiv.simulation.simulate import simulate
+
+        folder, scene = self.folder, self.scene
+        dynamic = stages.ensure_gaussians(folder, self.config, scene, progress)
+        trajectory = stages.ensure_trajectory(folder, self.config, scene, progress)
+        twin = stages.ensure_twin(folder, self.config, scene, progress)
+        with stages.material_description(folder, self.config, twin):
+            rollout = simulate(twin, frames=scene.frame_count, fps=scene.fps, progress=progress)
+            rollout.save(folder.rollout)
+            numbers = run_numbers(folder, scene, dynamic, trajectory, rollout.positions)
+        numbers |= material_numbers(folder)
+        write_json(folder.metrics, numbers)
+        progress("report", 0, 1)
+        write_report(folder, scene, dynamic, trajectory, twin, rollout.positions, numbers)
+        progress("report", 1, 1)
+        law = twin.law.description()
+        data: dict[str, Any] = {"run": str(self.path), "report": str(folder.report), "law": law, "metrics": numbers}
+        families = twin.fit.get("families", [])
+        if families:
+            data["families"] = families
+        return Summary(data, f"{table(numbers)}\n{law_text(law, families)}report   {folder.report}")
+
+    def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:
+        refuse(request, ("group", "condition"), "tracks", self.folder.scene_path)
+        self.folder.require("identify")
+        runs: list[VideoRun] = [self]
+        if request.second_run is not None:
+            other = reopen_run(request.second_run, Overrides(arch=self.config.arch), require="trajectory")
+            if not isinstance(other, VideoRun):
+                raise InputError(
+                    f"--second-run {request.second_run} is of a scene of {other.layouts}: give one of pictures"
+                )
+            runs.append(other)
+        self.start()
+        from masiv.pipeline.refine_video import refine_runs
+
+        return refine_runs(runs, request, progress)
+
+    def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
+        refuse(request, ("condition",), "tracks", self.folder.scene_path)
+        self.folder.require("identify")
+        views = request.view or (0,)
+        for index in views:
+            if not 0 <= index < len(self.scene.cameras):
+                raise InputError(f"--view {index}: the scene has cameras 0 to {len(self.scene.cameras) - 1}")
+        if request.force is None and (request.force_from is not None or request.force_until is not None):
+            raise InputError("--force-from and --force-until need --force FX,FY,FZ")
+        if request.blend is not None and request.law is None:
+            raise InputError("--blend W needs --law OTHER_RUN, the run whose material is blended in")
+        self.start()
+        from masiv.pipeline.variation import vary_twin
+        from masiv.report.film import film
+        from masiv.simulation.simulate import Push, simulate
+        from masiv.simulation.twin_effects import body_mass
+        from masiv.simulation.variation import without_effects
+
+        push = None
+        if request.force is not None:
+            until = float("inf") if request.force_until is None else request.force_until
+            push = Push(request.force, request.force_from or 0.0, until)
+        twin, gaussians = vary_twin(
+            self.folder,
+            law=request.law,
+            blend=request.blend,
+            geometry=request.geometry,
+            density=request.density,
+            ground=request.ground,
+        )
+        twin = without_effects(twin, request.without)
+        rollout = simulate(
+            twin, frames=request.frames, fps=self.scene.fps, velocity=request.velocity, omega=request.omega,
+            gravity=request.gravity, push=push, progress=progress,
+        )  # fmt: skip
+        out.mkdir(parents=True, exist_ok=True)
+        rollout.save(out / "rollout.npz")
+        data = {
+            "rollout": str(out / "rollout.npz"),
+            "frames": request.frames,
+            "particles": rollout.positions.shape[1],
+            "mass_kg": body_mass(twin),
+            "law": twin.law.description(),
+            "effects": [effect.name for effect in twin.effects],
+        }
+        if request.render:
+            drawn = replace(self.scene, ground=self.scene.ground if request.ground is None else twin.ground)
+            film(drawn, gaussians(), rollout.positions, list(views), out, progress=progress)
+            data["video"] = str(out / "video.mp4")
+        return Summary(data, "\n".join(str(data[name]) for name in ("rollout", "video") if name in data))
+
+    def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
+        if truth is None:
+            raise InputError("--truth is missing: give the folder with particles_F.npy")
+        self.folder.require("trajectory")
+        self.start()
+        from masiv.report.numbers import evaluation_numbers, table
+        from masiv.runfolder import load_motion
+        from masiv.twin import Twin
+
+        dynamic, trajectory = stages.load_gaussians(self.folder), stages.load_trajectory(self.folder)
+        twin, rollout = None, None
+        if self.folder.done("identify") and self.folder.rollout.is_file():
+            twin, (rollout, _) = Twin.load(self.path), load_motion(self.folder.rollout)
+        numbers = evaluation_numbers(
+            self.folder, self.scene, dynamic, trajectory, twin, rollout, truth, progress=progress
+        )
+        write_json(self.folder.evaluation, numbers)
+        data = {"evaluation": str(self.folder.evaluation), **numbers}
+        return Summary(data, f"{table(numbers)}\n{self.folder.evaluation}")
