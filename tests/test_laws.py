@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
+from masiv.kernels.lattice import LATTICE_COUNTS, LATTICE_STEP
 from masiv.materials import table
 from masiv.materials.classical import DIFFERENTIABLE, PARAMETERS, ClassicalLaw
 from masiv.materials.load import load_law
@@ -117,17 +118,17 @@ def test_a_steep_rate_is_perfect_plasticity():
 
 
 def test_the_envelope_is_the_largest_lipschitz_table_below():
-    shape = (*table.COUNTS, 1)
+    shape = (*LATTICE_COUNTS, 1)
     values = 5 * torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=F64)
     values[20, 10, 4] = 0.0
     out = table.lipschitz_envelope(values.reshape(-1, 1)).reshape(shape)
     assert (out <= values).all()
     for axis in range(3):
-        assert float(out.diff(dim=axis).abs().max()) <= table.STEP + table.ROUNDING
+        assert float(out.diff(dim=axis).abs().max()) <= LATTICE_STEP + table.ROUNDING
     i, j, k = 22, 9, 7
-    cone = sum(abs(a - b) for a, b in zip((i, j, k), (20, 10, 4), strict=True)) * table.STEP
+    cone = sum(abs(a - b) for a, b in zip((i, j, k), (20, 10, 4), strict=True)) * LATTICE_STEP
     assert float(out[i, j, k]) <= cone + 1e-12
-    tiny = torch.full((math.prod(table.COUNTS), 1), 1e-9)
+    tiny = torch.full((math.prod(LATTICE_COUNTS), 1), 1e-9)
     assert torch.equal(table.lipschitz_envelope(tiny), tiny)
 
 

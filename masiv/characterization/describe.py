@@ -239,7 +239,7 @@ def _yield(law: Law, kind: str, strain: float, dt: float) -> tuple[Quantity, boo
 
 
 def _friction(law: Law, log_volume: float, strain: float, dt: float) -> Quantity:
-    """From |tau_dev| = 3 alpha p in shear under pressure, alpha as of ``masiv.kernels.tensor.drucker_prager``."""
+    """From |tau_dev| = 3 alpha p in shear under pressure, alpha as of ``masiv.kernels.laws.drucker_prager``."""
     amounts = math.sqrt(3) * strain * np.arange(1, POINTS + 1) / POINTS
     stress = curves.drive(law, curves.simple_shear(amounts, log_volume)[:, None], dt)[1][-1, 0]
     pressure = -float(stress.trace()) / 3

@@ -56,7 +56,7 @@ class AdapterLaw(Law):
         return REACH * torch.tanh(self.up(self.down(hidden)) / REACH)
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
-        """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
+        """Coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress`` from invariants (N, 3)."""
         factor = torch.exp(self.correction(invariants))
         g1, g2, kappa, coupling = base_moduli(self.base, invariants).unbind(1)
         return torch.stack([g1 * factor[:, 0], g2 * factor[:, 1], kappa * factor[:, 2], coupling * factor[:, 0]], dim=1)
@@ -119,7 +119,7 @@ class AdapterLaw(Law):
 
 
 def base_moduli(law: ClassicalLaw, invariants: torch.Tensor) -> torch.Tensor:
-    """A classical stress as coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress``.
+    """A classical stress as coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress``.
 
     Exact for neo-Hookean solids and fluids; of Hencky's strain, ln b is dev(b - b^-1) / (2 sqrt(1 + q/3)) to third
     order, q = (I1 + I2)/2 - 3.

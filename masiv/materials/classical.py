@@ -1,4 +1,4 @@
-"""Classical laws with a few parameters. Formulas and sources: ``masiv.kernels.tensor``."""
+"""Classical laws with a few parameters. Formulas and sources: ``masiv.kernels.laws``."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class ClassicalLaw(Law):
 
     def coefficients(self, dt: float) -> torch.Tensor:
         """What the kernels take in a substep of dt [s], shape (K,): see the ``c`` of each function in
-        ``masiv.kernels.tensor``."""
+        ``masiv.kernels.laws``."""
         mu, lam = self.elastic_moduli()
         if self.kind == "neo_hookean":
             return torch.stack([mu, lam])
@@ -173,7 +173,7 @@ class ClassicalLaw(Law):
 
 
 def isochoric_flow(f: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
-    """F (N, 3, 3) after a ``share`` of its isochoric Hencky strain has flowed: ``masiv.kernels.tensor.neural_flow``."""
+    """F (N, 3, 3) after a ``share`` of its isochoric Hencky strain has flowed: ``masiv.kernels.isotropic.flow``."""
     eye = torch.eye(3, dtype=f.dtype)
     b = torch.linalg.det(f)[:, None, None] ** (-2 / 3) * (f @ f.mT)
     b_inverse = torch.linalg.inv(b)

@@ -123,7 +123,7 @@ class NeuralLaw(Law):
         return table.lipschitz_envelope(dt * torch.exp(self.rate_table()))
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
-        """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
+        """Coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress`` from invariants (N, 3)."""
         value = table.interpolate(self.moduli_table(), self.features(invariants, STRAIN_SCALE))
         return torch.cat([torch.exp(value[:, :3]), value[:, 3:]], dim=1)
 
