@@ -11,7 +11,7 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.inference.model_fit import clipped_step
