@@ -10,9 +10,9 @@ from masiv.effects.catalogue import effects
 from masiv.effects.effect import EffectContext
 from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
-from masiv.simulation.simulate import rigid_initial_state
 
 F64 = torch.float64
 DT, STEPS = 1e-3, 40

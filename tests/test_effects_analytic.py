@@ -12,8 +12,8 @@ from test_effects import DT, F64, LAW, body, setting, simulator
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.simulation.simulate import rigid_initial_state
 
 WEIGHTLESS = (0.0, 0.0, 0.0)
 G = 9.8

@@ -12,11 +12,11 @@ from masiv.identify.start import with_scales
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
+from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm._reference import _substep
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulator import Simulator, State
 from masiv.pretraining.pretrain import pretrained_path
-from masiv.simulation.simulate import rigid_initial_state
 
 pytestmark = pytest.mark.usefixtures("taichi")
 F64 = torch.float64

@@ -14,19 +14,19 @@ from masiv.effects.catalogue import effect_named
 from masiv.effects.effect import EffectContext
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import clipped_step
-from masiv.inference.noise_floor import noise_floor
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.initial_state import rigid_initial_state
+from masiv.models.parameters import Parameter
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
+from masiv.observations.noise_floor import noise_floor
 from masiv.refine.config import RefineConfig
 from masiv.refine.stage import Throw, refine, split_frames
 from masiv.refine.summary import summary
 from masiv.scene.scene import Ground, Scene
-from masiv.simulation.simulate import rigid_initial_state
 
 pytestmark = pytest.mark.usefixtures("taichi")
 FPS, FRAMES, FITTED = 24.0, 14, 10

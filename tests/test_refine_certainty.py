@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from masiv.inference.least_squares import Parameter
 from masiv.inference.significance import vuong_z, wald_z_gls
 from masiv.inference.smooth_noise import smoothness
+from masiv.models.parameters import Parameter
 
 INSTANTS, POINTS = 11, 120
 LENGTH, METRES, SIZE = 2.0, 0.12, 2e-3

@@ -21,8 +21,9 @@ from masiv.identify.config import IdentifyConfig
 from masiv.identify.start import _effort, choose_start
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import Model, Simulation, parameters
+from masiv.models.initial_state import InitialState
 from masiv.models.prepare import video_observation
-from masiv.models.problem import InitialState, Problem
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import DONE, baselines, derived

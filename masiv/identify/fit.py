@@ -21,7 +21,8 @@ from masiv.identify.pictures import compared, picture_errors, picture_objective
 from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 

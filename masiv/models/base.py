@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
-from masiv.inference.least_squares import Parameter
+from masiv.models.parameters import Parameter
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -12,10 +12,11 @@ import torch
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
 from masiv.errors import InputError, MasivError, NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.models.base import EffectTerm, SharedRollouts, WeightedResidual, effect_parameters, plain_term
-from masiv.models.families import Family, initial_state_from, initial_state_parameters, law_of
-from masiv.models.problem import InitialState, Problem
+from masiv.models.families import Family, law_of
+from masiv.models.initial_state import InitialState, initial_state_parameters
+from masiv.models.parameters import Parameter
+from masiv.models.problem import Problem
 
 if TYPE_CHECKING:
     from masiv.inference.model_fit import ModelFit
@@ -92,7 +93,7 @@ def parameters(model: Model, observations: Sequence[VideoObservation]) -> tuple[
     own = [
         replace(p, name=f"{p.name}@{e.name}")
         for e in observations
-        for p in initial_state_parameters(e.problem, e.motion)
+        for p in initial_state_parameters(e.motion, e.problem.ground_range)
         if p.name not in gone
     ]
     grids = [Parameter(f"{GRID_CHANGE}@{e.name}", 0.0, -1.0, 3.0, 0.25) for e in observations if e.grid_changes]
@@ -103,7 +104,7 @@ def parameters(model: Model, observations: Sequence[VideoObservation]) -> tuple[
 def initial_state_of(values: Mapping[str, float], observation: VideoObservation) -> InitialState:
     """The throw of ``observation`` among ``values``."""
     suffix = f"@{observation.name}"
-    return initial_state_from({n.removesuffix(suffix): v for n, v in values.items() if n.endswith(suffix)})
+    return InitialState.of_values({n.removesuffix(suffix): v for n, v in values.items() if n.endswith(suffix)})
 
 
 def active(model: Model, values: Mapping[str, float], problem: Problem) -> ActiveEffects | None:
@@ -180,7 +181,7 @@ class Simulation(SharedRollouts):
         throws = {
             f"{p.name}@{e.name}": p.start
             for e in self.observations
-            for p in initial_state_parameters(e.problem, e.motion)
+            for p in initial_state_parameters(e.motion, e.problem.ground_range)
         }
         return {name: throws.get(name, value) for name, value in values.items()}
 

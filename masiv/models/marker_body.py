@@ -14,6 +14,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.effect import EffectContext
 from masiv.errors import InputError, MasivError
 from masiv.models.attachment import Attachment, attach
+from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import at_rest, rollout
@@ -65,11 +66,13 @@ class SimulatedBody:
         """Longest side [m] of the particles' bounding box."""
         return float((self.particles.max(0).values - self.particles.min(0).values).max())
 
-    def released(self, dtype: torch.dtype = torch.float32, lift: float = 0.0) -> State:
-        """State at the release: at rest, stress-free if ``lift`` [m] is 0 (``masiv.models.cantilever_preload``)."""
-        from masiv.models.cantilever_preload import bent
-
-        x, gradient = bent(self, lift)
+    def released(self, dtype: torch.dtype = torch.float32, deflection: float = 0.0) -> State:
+        """State at the release: at rest. It is stress-free if ``deflection`` [m] is 0, else bent as by its weight."""
+        x = self.particles.double()
+        gradient = torch.eye(3, dtype=x.dtype).expand(len(x), 3, 3)
+        axes = clamp_axes(self.gravity, self.normals)
+        if axes is not None and deflection != 0:
+            x, gradient = static_deflection(x, self.heights[0], axes, deflection)
         still = torch.zeros_like(x, dtype=dtype)
         return replace(at_rest(x.to(dtype), still, torch.zeros_like(gradient, dtype=dtype)),
                        trial_gradient=gradient.to(dtype).contiguous())  # fmt: skip

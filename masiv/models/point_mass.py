@@ -17,12 +17,12 @@ import torch
 from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.effect import DragBody, Effect, EffectContext, EffectParameter
 from masiv.errors import InputError, NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, rms_mm
 from masiv.kernels.points import point_kernels
 from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit, plain_term
 from masiv.models.families import Family
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 from masiv.refine.config import RefineConfig
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import Geometry

@@ -59,7 +59,7 @@ def refine_group(
         if {run.fitted for run in simulation.observations if run.body == body} != {True, False}:
             raise InputError(f"{tracks.path}: body {body} needs a run to fit and one with `use: hold_out` to judge by")
     base = baseline(simulation)
-    config = config.model_copy(update={"second_look": False})  # every body is looked at by itself already
+    config = config.model_copy(update={"search_second_effect": False})  # every body is looked at by itself already
     if dry_run:
         searched = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
     else:

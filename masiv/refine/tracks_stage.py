@@ -176,7 +176,7 @@ def refine_tracks(
         base = gauss_newton_fit(simulation, model, values, budget=config.tracks.rollouts)
         progress("refine: without effects", 1, 1, f"{base.fit_mm:.2f} mm")
         # No stop-gap for what is left: a smooth force would need as many rollouts as all causes together.
-        searched = config.refine.model_copy(update={"unexplained": np.inf, "second_look": False})
+        searched = config.refine.model_copy(update={"unexplained": np.inf, "search_second_effect": False})
         if dry_run:
             searched = searched.model_copy(update={"shortlist": 0, "above_noise": 0.0})
         result = search_effects(simulation, [base], searched, progress)
