@@ -213,6 +213,7 @@ def test_as_many_as_asked_or_as_there_are_cores():
     assert 1 <= process_count(0) <= 4
 
 
+@pytest.mark.slow
 def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.identify.start.MODULI", (1e4, 3e4))
     monkeypatch.setattr("masiv.identify.start.REFINED", 2)
@@ -264,6 +265,7 @@ def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
     assert fitted.model.contact == "sticky"
 
 
+@pytest.mark.slow
 def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
     simulation, _ = small_simulation()
