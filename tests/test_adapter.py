@@ -97,6 +97,7 @@ def test_an_adapter_survives_saving(tmp_path):
     assert law.description() == again.description()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("taichi")
 def test_fit_of_an_adapter_improves_on_its_base_and_resumes(body, tmp_path):  # noqa: F811
     class Stop(Exception):

@@ -108,7 +108,14 @@ def gradients(effect, contact, dtype):
     return torch.cat([bar.to(F64) for bar in bars])
 
 
-@pytest.mark.parametrize(("name", "contact"), CASES)
+ONE_A_KIND = ("ground_friction", "ground_height", "point_force", "point_mass", "quadratic_drag", "viscosity")
+"""On the contact, a shift, a force at a place, masses, on the nodes of the grid, in the stress."""
+
+
+@pytest.mark.parametrize(
+    ("name", "contact"),
+    [pytest.param(*c, marks=() if c[0] in ONE_A_KIND and c[1] == "sticky" else pytest.mark.slow) for c in CASES],
+)
 def test_gradient_in_single_precision(name, contact):
     """What is fitted runs in it, and a compiler that is told to leave out a pass may differentiate it wrongly."""
     double, single = (gradients(effects()[name], contact, dtype) for dtype in (F64, torch.float32))
