@@ -24,7 +24,7 @@ from masiv.refine.experiment_design import Proposal, propose
 from masiv.refine.search import SearchResult, search_effects
 from masiv.scene.scene import Scene
 from masiv.twin import Twin, TwinEffect
-from masiv.workers import Workers, processes_wanted
+from masiv.workers import Workers, process_count
 
 COMPETITORS = {
     "jelly": ("neo_hookean", "von_mises"),
@@ -92,7 +92,7 @@ def refine(
         ]
         simulation = Simulation([observation for observation, *_ in made])
         _, coarse, coarser, initial_motion = made[0]
-        with Workers(processes_wanted(config.processes)) as workers:
+        with Workers(process_count(config.processes)) as workers:
             fits = baselines(
                 simulation,
                 coarse,

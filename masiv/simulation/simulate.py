@@ -18,7 +18,8 @@ from masiv.errors import InputError, NonFiniteError
 from masiv.files import write_npz
 from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.design import grid_spacing, substeps_per_frame
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.progress import Progress, silent
 from masiv.scene.transforms import SimulationFrame
 from masiv.simulation.subdivide import finer
