@@ -108,7 +108,9 @@ def body_run(
     """``run`` from ``skip`` to ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises
     InputError."""
     if not skip < duration:
-        raise InputError(f"run {run.name}: unsteady: {skip:g} s leaves nothing of tracks.duration {duration:g} s")
+        raise InputError(
+            f"run {run.name}: ignore_after_release: {skip:g} s leaves nothing of tracks.duration {duration:g} s"
+        )
     if run.release is None:
         raise InputError(f"{tracks.path}: run {run.name}: nobody knows when it was let go: give rest_frames")
     body = simulated_body(tracks, run, config, particle_spacing=spacing)
