@@ -27,7 +27,7 @@ from masiv.models.families import FAMILIES
 from masiv.models.initial_state import InitialState
 from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
-from masiv.workers import TaskError, Workers, processes_wanted
+from masiv.workers import TaskError, Workers, process_count
 
 SHORT = 1 / 3
 FINALISTS = 2
@@ -49,7 +49,7 @@ def identify_classical(
     pictures = wanted(problem)
     failures: dict[str, str] = {}
     if law == "auto":
-        with Workers(processes_wanted(config.processes), "identify.processes") as workers:
+        with Workers(process_count(config.processes), "identify.processes") as workers:
             fits, failures = _shortlisted(coarse, motion, first_frames, pictures, checkpoint, progress, workers)
     else:
         fits = [fit_family(law, coarse, motion, first_frames, checkpoint, progress, pictures=pictures)]

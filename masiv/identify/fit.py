@@ -86,7 +86,7 @@ def fit(
                 frames = min(descent.reach, _horizon(i, config.iterations, throw.first_frames, throw.problem.frames))
                 departure = torch.zeros(())
                 if isinstance(law, NeuralLaw) and isinstance(start, NeuralLaw) and config.prior_weight:
-                    departure = config.prior_weight * law.departure(start)
+                    departure = config.prior_weight * law.prior_distance(start)
                 passed.append(
                     _descend(throw.problem, law, motion, contact, frames, departure, 1 / len(throws), (seed, i, k))
                 )

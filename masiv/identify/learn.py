@@ -16,7 +16,7 @@ from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
 from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
-from masiv.workers import TaskError, Workers, processes_wanted, run_task, unwrap
+from masiv.workers import TaskError, Workers, process_count, run_task, unwrap
 
 RIVAL = 1.3
 """The second start is fitted, too, where its error is at most this factor of the first's. Starts are simulated with few
@@ -40,11 +40,11 @@ def learn(
     for the search of a start. Raises MasivError."""
     config = throws[0].problem.config
     saved = checkpoint.load() or {}
-    with Workers(processes_wanted(config.processes), "identify.processes") as workers:
+    with Workers(process_count(config.processes), "identify.processes") as workers:
         if "starts" in saved:
             starts = [_start_from(state) for state in saved["starts"]]
         else:
-            workers.begin()
+            workers.start()
             starts = _worth_fitting(choose_start(coarse(), throws[0].motion, progress, workers))
         keeper = _With(checkpoint, {"starts": [_start_state(start) for start in starts]})
         if "starts" not in saved:

@@ -12,7 +12,7 @@ import torch
 from masiv.continuum.trajectory import Trajectory
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.law import Law
 from masiv.models.geometry_loss import chamfer_error, surface_points, trajectory_error

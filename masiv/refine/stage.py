@@ -23,7 +23,7 @@ from masiv.refine.search import SearchResult, search_effects
 from masiv.scene.scene import Scene
 from masiv.simulation.fitted_twin import fitted_twin
 from masiv.twin import Twin
-from masiv.workers import Workers, processes_wanted
+from masiv.workers import Workers, process_count
 
 COMPETITORS = {
     "jelly": ("neo_hookean", "von_mises"),
@@ -91,7 +91,7 @@ def refine(
         ]
         simulation = Simulation([observation for observation, *_ in made])
         _, coarse, coarser, initial_motion = made[0]
-        with Workers(processes_wanted(config.processes)) as workers:
+        with Workers(process_count(config.processes)) as workers:
             fits = baselines(
                 simulation,
                 coarse,

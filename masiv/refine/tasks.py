@@ -15,7 +15,7 @@ NAMES_A_TASK = 3
 
 def map_tasks(workers: Workers, simulation: ForwardModel, function: Callable, tasks: Iterable[tuple]) -> Iterator[Any]:
     """``function(simulation, *task)`` of each task, in order, or ``TaskError``; rollouts are counted."""
-    for found, rollouts in workers.map(_counted, [(function, simulation, *task) for task in tasks]):
+    for found, rollouts in workers.map(_counted, tasks, shared=(function, simulation)):
         simulation.rollouts += rollouts
         yield found
 
