@@ -42,8 +42,8 @@ names = st.text(st.characters(codec="utf-8", exclude_categories=["Cs", "Cc"]), m
 @st.composite
 def laws(draw):
     kind = draw(st.sampled_from(sorted(PARAMETERS)))
-    values = {name: draw(st.floats(*(RANGES.get(name, (1e-3, 1e8))), exclude_min=True, exclude_max=True, allow_subnormal=False))
-              for name in PARAMETERS[kind]}  # fmt: skip
+    inside = {"exclude_min": True, "exclude_max": True, "allow_subnormal": False}
+    values = {name: draw(st.floats(*RANGES.get(name, (1e-3, 1e8)), **inside)) for name in PARAMETERS[kind]}
     law = ClassicalLaw(kind, **values)
     law.stderr = {name: draw(positive) for name in values if draw(st.booleans())}
     return law
