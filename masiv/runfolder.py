@@ -64,6 +64,9 @@ class RunFolder:
             raise InputError(
                 f"{path / 'run.yaml'} was not written by this version of masiv: start a new run with --out"
             )
+        from masiv.config import renamed_keys
+
+        record["config"] = renamed_keys(record["config"])
         return cls(path, record)
 
     @classmethod

@@ -12,6 +12,7 @@ import numpy as np
 from masiv.characterization import curves
 from masiv.characterization.excitation import Excited, Sensitivity, excited_range, sensitivities
 from masiv.characterization.families import Match, nearest_families
+from masiv.files import write_json
 from masiv.materials.law import Law
 from masiv.progress import Progress, silent
 from masiv.subsample import kd_tree_subset
@@ -60,7 +61,6 @@ class Material:
 
     def save(self, path: Path) -> None:
         """Write ``path`` (.json), complete or not at all."""
-        from masiv.files import write_json
 
         write_json(path, self.as_data())
 
@@ -71,7 +71,7 @@ def describe(law: Law, excited: Excited, *, substep: float = 5e-4) -> Material:
     Moduli are those of the stress at F = I. Yield is where 0.2 % of an axial strain with free sides is permanent: the
     0.2 % offset without its assumption that unloading follows the slope at rest, which no large strain does.
     """
-    law = curves.exact(law)
+    law = curves.in_float64(law)
     strain = float(np.clip(excited.strain[1], SMALLEST, LARGEST))
     log_volume = min(excited.log_volume[0], -2e-3), max(excited.log_volume[1], 2e-3)
     rate = max(excited.rate, strain / (POINTS * 2 * substep))  # slower loading would flow in too long steps
@@ -242,7 +242,7 @@ def _yield(law: Law, kind: str, strain: float, dt: float) -> tuple[Quantity, boo
 
 
 def _friction(law: Law, log_volume: float, strain: float, dt: float) -> Quantity:
-    """From |tau_dev| = 3 alpha p in shear under pressure, alpha as of ``masiv.kernels.tensor.drucker_prager``."""
+    """From |tau_dev| = 3 alpha p in shear under pressure, alpha as of ``masiv.kernels.laws.drucker_prager``."""
     amounts = math.sqrt(3) * strain * np.arange(1, POINTS + 1) / POINTS
     stress = curves.drive(law, curves.simple_shear(amounts, log_volume)[:, None], dt)[1][-1, 0]
     pressure = -float(stress.trace()) / 3
@@ -272,7 +272,7 @@ def _drawn(
 
     family = None
     if nearest.parameters:
-        family = curves.exact(ClassicalLaw(nearest.kind, **{n: v["value"] for n, v in nearest.parameters.items()}))
+        family = curves.in_float64(ClassicalLaw(nearest.kind, **{n: v["value"] for n, v in nearest.parameters.items()}))
     reach = WIDER * strain
     steps = np.arange(1, POINTS + 1) / POINTS
     shear = curves.there_and_back(math.sqrt(3) * reach, POINTS)

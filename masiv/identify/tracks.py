@@ -57,7 +57,7 @@ def simulation_of(
 
     spacing = (body.geometry.volume / config.particles) ** (1 / 3)
     runs = [
-        body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.unsteady)
+        body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.ignore_after_release)
         for run in runs_of(tracks, condition)
     ]
     last = max(float(run.times[-1]) for run in runs)
@@ -69,7 +69,7 @@ def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:
     """Poisson's ratio, where the scene declares it: no more than what is affordable."""
     if body.poissons_ratio is None:
         return {}
-    return {"poissons_ratio": min(body.poissons_ratio, config.highest_poissons_ratio)}
+    return {"poissons_ratio": min(body.poissons_ratio, config.max_poissons_ratio)}
 
 
 def family_of(kind: str, density: float, known: dict[str, float]) -> Family:

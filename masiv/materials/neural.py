@@ -17,7 +17,6 @@ F once a substep, which ties the law to the substep.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -31,10 +30,11 @@ if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
 
 STRAIN_SCALE = 0.02
-LOG_MODULUS_RANGE = 6.0
-EVERY = 5
-"""Of the lattice's nodes, every which one ``departure`` looks at: no count of the lattice is a multiple of it."""
-LOG_RATE_RANGE = 14.0  # relaxation rates of e^-14 to e^14 per second
+"""Strain [1] beyond which the elastic features are logarithmic."""
+LOG_MODULUS_RANGE, LOG_RATE_RANGE = 6.0, 14.0
+"""Moduli are e^-6 to e^6 of the stress scale, relaxation rates e^-14 to e^14 per second."""
+PRIOR_STRIDE = 5
+"""``prior_distance`` takes every fifth node of the lattice: no count of the lattice is a multiple of 5."""
 
 
 def strain_invariants(deformation_gradient: torch.Tensor) -> torch.Tensor:
@@ -106,6 +106,9 @@ class NeuralLaw(Law):
 
     def moduli_table(self) -> torch.Tensor:
         """ln g1, ln g2, ln kappa and coupling [Pa] at the nodes of ``masiv.materials.table``, (K, 4)."""
+        return self.once("moduli", self._moduli_table)
+
+    def _moduli_table(self) -> torch.Tensor:
         raw = self.elastic(table.nodes(self.log_stress_scale.dtype))
         shear, bulk = (LOG_MODULUS_RANGE * torch.tanh(part / LOG_MODULUS_RANGE) for part in raw[:, :3].split((2, 1), 1))
         coupling = torch.exp(self.log_stress_scale) * torch.tanh(raw[:, 3:])
@@ -114,6 +117,9 @@ class NeuralLaw(Law):
 
     def rate_table(self) -> torch.Tensor:
         """Logarithms of the isochoric and volumetric relaxation rate [1/s] at the nodes, (K, 2)."""
+        return self.once("rates", self._rate_table)
+
+    def _rate_table(self) -> torch.Tensor:
         raw = self.plastic(table.nodes(self.log_stress_scale.dtype))
         isochoric, volumetric = raw.split(1, dim=1)
         moved = torch.cat([isochoric + self.log_flow_rate, volumetric], dim=1)
@@ -121,10 +127,10 @@ class NeuralLaw(Law):
 
     def flow_table(self, dt: float) -> torch.Tensor:
         """-ln of the shares of isochoric and volumetric strain that a substep of dt [s] keeps, at the nodes, (K, 2)."""
-        return table.gentle(dt * torch.exp(self.rate_table()))
+        return self.once(("flow", dt), lambda: table.lipschitz_envelope(dt * torch.exp(self.rate_table())))
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
-        """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
+        """Coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress`` from invariants (N, 3)."""
         value = table.interpolate(self.moduli_table(), self.features(invariants, STRAIN_SCALE))
         return torch.cat([torch.exp(value[:, :3]), value[:, 3:]], dim=1)
 
@@ -152,10 +158,10 @@ class NeuralLaw(Law):
         pressure = 0.5 * kappa * (j - 1 / j) + coupling * (_trace(b) - 3)
         return g1 * _deviator(b) - g2 * _deviator(b_inverse) + pressure * eye
 
-    def departure(self, other: NeuralLaw) -> torch.Tensor:
+    def prior_distance(self, other: NeuralLaw) -> torch.Tensor:
         """Mean square difference () of the networks' outputs (log moduli relative to the stress scale, coupling, log
         rates) from those of ``other`` over the lattice of strain features; the scales do not count."""
-        nodes = table.nodes(self.log_stress_scale.dtype)[::EVERY]
+        nodes = table.nodes(self.log_stress_scale.dtype)[::PRIOR_STRIDE]
         with torch.no_grad():
             were = other.elastic(nodes), other.plastic(nodes)
         now = self.elastic(nodes), self.plastic(nodes)
@@ -219,23 +225,18 @@ def _isochoric(f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tenso
     return j, b, torch.linalg.inv(b), torch.eye(3, dtype=f.dtype)
 
 
-@functools.lru_cache(maxsize=8)
-def _neural_kernels(mpm):
-    from masiv.kernels.neural import NeuralKernels
-
-    return NeuralKernels(mpm)
-
-
 class _BoundNeural(SharedBoundLaw):
     """The networks run once here; kernels interpolate their tables."""
 
     def __init__(self, law: NeuralLaw, mpm: MpmKernels, count: int, dt: float) -> None:
-        self.kernels = _neural_kernels(mpm)
+        from masiv.kernels.neural import NeuralKernels
+
+        self.kernels = mpm.attached(NeuralKernels, lambda: NeuralKernels(mpm))
         self.count = count
         self.parameters = tuple(law.parameters())
         with torch.enable_grad():
             self.tables = (law.moduli_table(), law.flow_table(dt), torch.exp(law.log_flow_strain))
-        self.dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
+        self.dtype = mpm.torch_dtype
         self._own()
 
     def write(self) -> None:

@@ -18,7 +18,9 @@ from scipy.interpolate import CubicSpline
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
-from masiv.effects.effect import DragBody, Effect, EffectContext, EffectParameter
+from masiv.effects.context import EffectContext, EffectParameter
+from masiv.effects.effect import ClockEffect, ContactEffect, Effect, GeometryEffect
+from masiv.effects.per_body import DragBody
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.files import write_npz
 from masiv.inference.model_fit import ModelFit, rms_mm
@@ -163,22 +165,24 @@ class BodySimulation(SharedRollouts):
 
     def candidates(self, model: Model) -> list[str]:
         """Effects that ``model`` lacks; a clock that is off is a release at another time, and so is fitted already."""
-        taken = not self.ground or any(effect_named(n).on_grid == "ground" for n in model.effects)
+        taken = not self.ground or any(isinstance(effect_named(n), ContactEffect) for n in model.effects)
         out = []
         for name, effect in causes().items():
-            on_ground = effect.on_grid == "ground" or name == "ground_height"
-            free = effect.needs_clamp and not len(self.observations[0].body.heights)
-            if name not in model.effects and name != "time_offset" and not (on_ground and taken) and not free:
+            on_ground = isinstance(effect, (ContactEffect, GeometryEffect))
+            clock = isinstance(effect, ClockEffect)
+            free = effect.hints.needs_clamp and not len(self.observations[0].body.heights)
+            if name not in model.effects and not clock and not (on_ground and taken) and not free:
                 out.append(name)
         return out
 
     def term(self, name: str) -> EffectTerm:
         """The effect, its steps in proportion to the body."""
         effect = effect_named(name)
-        own = [self._parameter(effect, p) for p in effect.shared or effect.parameters]
+        declared = (effect.per_body or effect).parameters
+        own = [self._parameter(effect, p) for p in declared]
         cut = effect.strengths
         guesses = tuple(tuple(g) for g in effect.guesses(self._setting(self.observations[0])))
-        units = {f"{name}.{p.name}": p.unit for p in effect.shared or effect.parameters}
+        units = {f"{name}.{p.name}": p.unit for p in declared}
         return EffectTerm(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
 
     def _parameter(self, effect: Effect, p: EffectParameter) -> Parameter:
@@ -193,20 +197,20 @@ class BodySimulation(SharedRollouts):
         elif p.unit == "m":
             step = 0.04 * size
             if p.name in "xyz":  # a place is in the body or at it
-                k, reach = "xyz".index(p.name), 0.0 if effect.inside else BESIDE * size
+                k, reach = "xyz".index(p.name), 0.0 if effect.hints.inside else BESIDE * size
                 lower, upper = float(low[k]) - reach, float(high[k]) + reach
         return Parameter(f"{effect.name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
 
     def _setting(self, run: BodyRun) -> EffectContext:
         duration = float(run.times[-1])
-        return run.body.effects((), duration=duration, frame_time=duration / (len(run.times) - 1)).setting
+        return run.body.effects((), duration=duration, frame_time=duration / (len(run.times) - 1)).context
 
     def _members(self, model: Model, values: Mapping[str, float]) -> tuple:
         out = []
         for name in model.effects:
             effect = effect_named(name)
             given = torch.tensor([values[p.name] for p in self.term(name).parameters], dtype=torch.float32)
-            out.append((effect, effect.of(given, self.outline) if effect.shared else given))
+            out.append((effect, effect.per_body.of_body(given, self.outline) if effect.per_body else given))
         return tuple(out)
 
     def law(self, model: Model, values: Mapping[str, float]) -> ClassicalLaw:
@@ -352,7 +356,8 @@ class BodySimulation(SharedRollouts):
     def objections(self, before: ModelFit, after: ModelFit, term: EffectTerm, config: RefineConfig) -> list[str]:
         """What the medium cannot do."""
         theta = torch.tensor([after.values[p.name] for p in term.parameters], dtype=torch.float64)
-        why = effect_named(term.effect).violates_bounds(theta, self.outline)
+        per_body = effect_named(term.effect).per_body
+        why = per_body.violates_bounds(theta, self.outline) if per_body else None
         return [] if why is None else [why]
 
 

@@ -11,14 +11,15 @@ import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.errors import InputError
 from masiv.models.attachment import Attachment, attach
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import fill_geometry
@@ -71,13 +72,13 @@ class SimulatedBody:
 
     def effects(self, members: tuple = (), *, duration: float, frame_time: float) -> ActiveEffects:
         """Effects with their parameters, and after them the clamp."""
-        from masiv.effects._clamp import clamped
+        from masiv.effects.boundary.clamp import with_clamp
 
         x = self.particles
         gravity = torch.as_tensor(self.gravity, dtype=x.dtype)
         setting = EffectContext(gravity, x, self.mass / len(x), self.size, duration, frame_time)
         active = ActiveEffects(tuple(members), setting)
-        return clamped(active, self.normals, self.heights) if len(self.heights) else active
+        return with_clamp(active, self.normals, self.heights) if len(self.heights) else active
 
     def markers_to_world(self, positions: torch.Tensor) -> np.ndarray:
         """Particles (T, N, 3) [m, simulation frame] -> markers (T, len(markers), 3) [m, world]."""

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.classical_fit import FamilyFit, fit_family, ranked
+from masiv.identify.classical.fit import FamilyFit, fit_family
+from masiv.identify.classical.model_selection import rank_by_bic
+from masiv.identify.losses.objective import Objective
 from masiv.inference.least_squares import linearize, with_start_values
 from masiv.inference.model_fit import ModelFit, evaluate_fit, gauss_newton_fit, residual_of
 from masiv.inference.robust import robust_scale_of
@@ -71,7 +73,7 @@ def _shortlist(
     motion = forward_model.observations[0].motion
     tasks = [(kind, problem.coarser, motion, problem.first_frames, SHORT_BUDGET) for kind in kinds]
     short = list(_known(kinds, workers.map(_fit_family, tasks), progress))
-    return [f.kind for f in ranked(_some(short))[: config.families]]
+    return [f.kind for f in rank_by_bic(_some(short))[: config.families]]
 
 
 def _fitted(
@@ -91,7 +93,7 @@ def _fitted(
 
 
 def _fit_family(kind: str, problem: Problem, motion: InitialState, first_frames: int, budget: float) -> FamilyFit:
-    return fit_family(kind, problem, motion, first_frames, Checkpoint(None), silent, share=budget)
+    return fit_family(kind, Objective(problem), motion, first_frames, Checkpoint(None), silent, budget_factor=budget)
 
 
 def _known(kinds: Sequence[str], results: Iterable[FamilyFit | TaskError], progress: Progress) -> Iterator[FamilyFit]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
-from masiv.identify.config import IdentifyConfig
+from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
 from masiv.models.free_body import Simulation
 from masiv.models.prepare import video_observation
 from masiv.mpm.config import SimulatorConfig
@@ -20,7 +20,7 @@ from masiv.refine.result import RefineResult
 from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import check_effects, refine
 from masiv.scene.scene import Scene
-from masiv.workers import Workers, processes_wanted
+from masiv.workers import Workers, process_count
 
 COMPETITORS = {
     "jelly": ("neo_hookean", "von_mises"),
@@ -31,8 +31,6 @@ COMPETITORS = {
     "sand": ("drucker_prager", "von_mises"),
 }
 """Classical laws that are worth a try, by the law whose rollout was nearest to the motion in identify."""
-FORMER_STARTS = {"honey": "maxwell_fluid"}
-"""Names of that law in run folders of earlier versions."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +79,10 @@ def refine_recordings(
     Raises InputError for an unknown effect in ``config.effects``, MasivError if no law explains the motion.
     """
     check_effects(config)
-    start = FORMER_STARTS.get(start or "", start)
+    start = RENAMED_STARTS.get(start or "", start)
     if not config.laws and start in COMPETITORS:
         config = config.model_copy(update={"laws": list(COMPETITORS[start])})
-    with runtime.torch_threads(1), Workers(processes_wanted(config.processes)) as workers:
+    with runtime.torch_threads(1), Workers(process_count(config.processes)) as workers:
         prepared = [
             video_observation(
                 r.name, r.scene, first_frames(r.motion, r.fit_frames), r.whole, identify, simulator, config

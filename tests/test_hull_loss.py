@@ -1,0 +1,37 @@
+"""The pull of a hull: none where Gaussians fill it, towards what they leave empty."""
+
+import numpy as np
+import torch
+
+from masiv.hull.carve import VisualHull
+from masiv.splat.hull_loss import HullLoss
+
+SPACING = 0.01
+
+
+def slab(height):
+    """A hull of 20 x ``height`` x 20 voxels, y up, and Gaussians that fill its lower four layers."""
+    axis, up = SPACING * (np.arange(20) + 0.5), SPACING * (np.arange(height) + 0.5)
+    points = np.stack(np.meshgrid(axis, up, axis, indexing="ij"), -1).reshape(-1, 3)
+    inner = np.all((points > 1.5 * SPACING) & (points < np.array([18.5, height - 1.5, 18.5]) * SPACING), axis=1)
+    means = points[points[:, 1] < 4 * SPACING]
+    return VisualHull(points, SPACING, ~inner), torch.tensor(means, dtype=torch.float32, requires_grad=True)
+
+
+def pulled(hull, means):
+    pull = HullLoss(hull)
+    far = pull(means, *pull.draw(len(means), 10**6, np.random.default_rng(0)))
+    (gradient,) = torch.autograd.grad(far, [means])
+    return float(far.detach()), float(gradient[:, 1].sum())
+
+
+def test_gaussians_that_fill_their_hull_are_not_pulled():
+    hull, means = slab(4)
+    assert pulled(hull, means) == (0.0, 0.0)
+
+
+def test_an_empty_part_of_a_hull_pulls():
+    hull, means = slab(12)
+    far, along = pulled(hull, means)
+    assert far > SPACING
+    assert along < 0  # the loss falls where Gaussians rise
