@@ -232,8 +232,8 @@ class TracksRun(Run):
 
 def refine_stem(condition: str | None, first: str) -> str:
     """Name of the files of ``refine`` without their extension: refine for the ``first`` condition (None: that one),
-    refine.CONDITION for another. A condition is any text, so what a file name cannot hold is percent-encoded, and so are
-    dots: no two conditions share a file, and none has that of a dry run, refine.CONDITION.dry_run."""
+    refine.CONDITION for another. A condition is any text: what a file name cannot hold is percent-encoded, and so are
+    dots, so that no two conditions share a file and none has that of a dry run (refine.CONDITION.dry_run)."""
     if condition is None or condition == first:
         return "refine"
     encoded = quote(condition, safe=" ").replace(".", "%2E")
