@@ -8,7 +8,9 @@ import numpy as np
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.classical_fit import FamilyFit, fit_family, ranked
+from masiv.identify.classical.fit import FamilyFit, fit_family
+from masiv.identify.classical.model_selection import rank_by_bic
+from masiv.identify.losses.objective import Objective
 from masiv.inference.model_fit import (
     ModelFit,
     column,
@@ -54,7 +56,7 @@ def baselines(
     if len(kinds) > config.families:
         found = workers.map(_fitted, [(kind, coarser, motion, first_frames, SHORT) for kind in kinds])
         short = _some(list(_known(kinds, found, progress)))
-        kinds = [f.kind for f in ranked(short)[: config.families]]
+        kinds = [f.kind for f in rank_by_bic(short)[: config.families]]
     saved = {kind: FamilyFit(**state) for kind, state in (checkpoint.load() or {}).items() if state["stage"] >= DONE}
     missing = [kind for kind in kinds if kind not in saved]
     found = workers.map(_fitted, [(kind, coarse, motion, first_frames, HALF) for kind in missing])
@@ -67,7 +69,7 @@ def baselines(
 
 
 def _fitted(kind: str, problem: Problem, motion: InitialState, first_frames: int, share: float) -> FamilyFit:
-    return fit_family(kind, problem, motion, first_frames, Checkpoint(None), silent, share=share)
+    return fit_family(kind, Objective(problem), motion, first_frames, Checkpoint(None), silent, budget_factor=share)
 
 
 def _known(kinds: Sequence[str], found: Iterable[FamilyFit | TaskError], progress: Progress) -> Iterator[FamilyFit]:

@@ -9,7 +9,7 @@ import numpy as np
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.effects.catalogue import effect_named
-from masiv.identify.config import IdentifyConfig
+from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
 from masiv.inference.model_fit import ModelFit
 from masiv.models.free_body import Simulation
 from masiv.models.prepare import video_observation
@@ -30,7 +30,7 @@ COMPETITORS = {
     "plasticine": ("von_mises", "neo_hookean", "non_newtonian"),
     "water": ("newtonian", "non_newtonian"),
     # A Maxwell fluid that relaxes slower than the motion lasts is a solid.
-    "honey": ("newtonian", "non_newtonian", "von_mises", "neo_hookean"),
+    "maxwell_fluid": ("newtonian", "non_newtonian", "von_mises", "neo_hookean"),
     "sand": ("drucker_prager", "von_mises"),
 }
 """Classical laws that are worth a try, by the law whose rollout was nearest to the motion in identify."""
@@ -83,6 +83,7 @@ def refine(
     for name in config.effects:
         effect_named(name)
     with runtime.torch_threads(1):
+        start = RENAMED_STARTS.get(start or "", start)
         if not config.laws and start in COMPETITORS:
             config = config.model_copy(update={"laws": list(COMPETITORS[start])})
         made = [
