@@ -222,9 +222,12 @@ class TracksRun(Run):
 
 def refine_stem(condition: str | None, first: str) -> str:
     """Name of the files of ``refine`` without their extension: refine for the ``first`` condition (None: that one),
-    refine.CONDITION for another. A condition is any text: what no file name may hold is percent-encoded, so that no two
-    conditions share a file."""
-    return "refine" if condition is None or condition == first else f"refine.{quote(condition, safe=' ')}"
+    refine.CONDITION for another. A condition is any text: what a file name cannot hold is percent-encoded, and so are
+    dots, so that no two conditions share a file and none has that of a dry run (refine.CONDITION.dry_run)."""
+    if condition is None or condition == first:
+        return "refine"
+    encoded = quote(condition, safe=" ").replace(".", "%2E")
+    return f"refine.{'dry%5Frun' if encoded == 'dry_run' else encoded}"
 
 
 def law_entry(twin: Twin) -> dict[str, Any]:
