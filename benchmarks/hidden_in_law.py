@@ -33,7 +33,7 @@ def main():
     from masiv.materials.classical import ClassicalLaw
     from masiv.observations.motion import SampledMotion
     from masiv.refine.config import RefineConfig
-    from masiv.refine.stage import Throw, refine, twin_of
+    from masiv.refine.stage import Throw, refine, refined_twin
     from masiv.refine.summary import summary
 
     runtime.start("cpu")
@@ -58,13 +58,13 @@ def main():
     found = refine([throw], config, settings.simulator, wanted, progress=quiet)
     document = summary(found, wanted, dry_run=False)
     print("refine:", document["verdict"], [(a["effect"], a["theta"], a["stderr"]) for a in document["accepted"]])
-    refined = twin_of(found.result.after, throw, found.simulation, twin)
+    refined = refined_twin(twin, found.result.after, found.simulation)
     laws["drag, refine's classical law"] = refined.law
     again = relearn(refined, seen, fitted, config, seed=0, progress=quiet)
     laws["drag, learnt anew beside the effect"] = again.law
     errors["drag, learnt anew beside the effect"] = again.fit["trajectory_error_mm"]
 
-    gradients = gone_through(replace(refined, law=laws["truth"]))
+    gradients = gone_through(refined.with_body(law=laws["truth"]))
     with torch.no_grad():
         over = {name: law.stress(gradients).double().numpy() for name, law in laws.items()}
     curves = {name: stresses(law) for name, law in laws.items()}
@@ -90,9 +90,9 @@ def gone_through(twin):
     """Elastic deformation gradients (M, 3, 3) of all particles at the fitted frames."""
     import torch
 
-    from masiv.simulation.simulate import march
+    from masiv.simulation.free_body import iterate_states
 
-    return torch.cat([state.trial_gradient for state in march(twin, frames=FRAMES, fps=twin.fps)])
+    return torch.cat([state.trial_gradient for state in iterate_states(twin, frames=FRAMES, fps=twin.fps)])
 
 
 def stresses(law):

@@ -38,9 +38,10 @@ def measured(run, truth_file, second, given):
 
     from masiv.config import RefineConfig
     from masiv.pipeline import reopen_run
-    from masiv.pipeline.refine_video import load_identified_twin, recording_of
+    from masiv.pipeline.refine_video import recording_of
     from masiv.refine.stage import refine
     from masiv.refine.summary import summary
+    from masiv.twin.identified import load_identified
 
     truth = yaml.safe_load(truth_file.read_text())
     throws, began = [], time.time()
@@ -50,7 +51,7 @@ def measured(run, truth_file, second, given):
             opened.start()
             first = opened.config
         throws.append(recording_of(opened, quiet))
-    twin = load_identified_twin(run)
+    twin = load_identified(run)
     config = RefineConfig.model_validate({**first.refine.model_dump(), **given})
     start = twin.fit.get("start") or twin.fit.get("law")
     loaded = time.time()

@@ -30,7 +30,7 @@ def body():
 
 
 def filmed(body, law):
-    truth = Twin(
+    truth = Twin.of_body(
         positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
         volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(split=1),
     )  # fmt: skip

@@ -16,11 +16,11 @@ from masiv.effects.catalogue import effects
 from masiv.errors import MasivError
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.attachment import attach
-from masiv.models.marker_body import fill_geometry, plan, simulated_body, simulated_markers
+from masiv.models.marker_body import plan, simulated_body, simulated_markers
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.tracks.declaration import GeometryDeclaration
-from masiv.tracks.geometry import make_geometry
+from masiv.tracks.geometry import fill_geometry, make_geometry
 from masiv.tracks.read import read_tracks
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))

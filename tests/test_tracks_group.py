@@ -13,9 +13,10 @@ import yaml
 
 from masiv.errors import InputError
 from masiv.models.free_body import Model
-from masiv.models.point_mass import RIGID, PointSimulation, mean_diameter, point_runs
+from masiv.models.point_mass import RIGID, PointSimulation, point_runs
 from masiv.refine.config import RefineConfig
 from masiv.refine.pooling import refine_group
+from masiv.tracks.geometry import mean_diameter
 from masiv.tracks.read import read_tracks
 
 pytestmark = pytest.mark.usefixtures("taichi")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
-from masiv.files import write_json, write_npz, write_yaml
+from masiv.files import write_json, write_npz
 from masiv.pipeline import stages
 from masiv.pipeline.requests import RefineRequest, Summary
 from masiv.progress import Progress
@@ -24,19 +22,17 @@ if TYPE_CHECKING:
     from masiv.splat.dynamic import DynamicGaussians
     from masiv.twin import Twin
 
-BEFORE = "twin.before.yaml"
-LAW_BEFORE = "law.before.safetensors"
-
 
 def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Progress) -> Summary:
     """Refine the first of ``runs`` jointly with the others; writes refine.json, refine.npz, the report and, if an
     effect is accepted, the new twin and what it gives."""
     from masiv.refine.stage import refine
     from masiv.refine.summary import text
+    from masiv.twin.identified import load_identified
 
     first = runs[0]
     recordings = [recording_of(run, progress) for run in runs]
-    twin = load_identified_twin(first.path)
+    twin = load_identified(first.path)
     checkpoint = first.folder.checkpoint("refine")
     result = refine(
         recordings,
@@ -63,27 +59,22 @@ def recording_of(run: VideoRun, progress: Progress) -> Throw:
     return Throw(run.path.resolve().name, run.scene, trajectory, held_out or trajectory, fitted)
 
 
-def load_identified_twin(run: Path) -> Twin:
-    """The twin that identify made, without effects that refine added: refining again starts from it."""
-    from masiv.twin import Twin
-
-    return Twin.load(run, BEFORE if (run / BEFORE).is_file() else "twin.yaml")
-
-
 def _save(
     run: VideoRun, recording: Throw, result: Refined, twin: Twin, request: RefineRequest, progress: Progress
 ) -> dict[str, Any]:
-    from masiv.refine.stage import twin_of
+    from masiv.refine.stage import refined_twin
     from masiv.refine.summary import summary
-    from masiv.simulation.simulate import Rollout, simulate
+    from masiv.simulation.rollout import Rollout
+    from masiv.simulation.simulate import simulate
+    from masiv.twin.identified import IDENTIFIED_FILE, restore_identified, save_refined
 
     folder, scene = run.folder, run.scene
     document = summary(result, run.config.refine, dry_run=request.dry_run)
     changed = bool(document["accepted"] or document["stop_gap"]) and not request.dry_run
-    new = twin_of(result.result.gap or result.result.after, recording, result.simulation, twin)
+    new = refined_twin(twin, result.result.gap or result.result.after, result.simulation)
     if request.relearn and changed:
         new = _relearn(run, new, progress)
-    old = twin_of(result.result.before, recording, result.simulation, twin)
+    old = refined_twin(twin, result.result.before, result.simulation)
     dynamic = stages.load_gaussians(folder)
     rollouts = {
         name: simulate(model, frames=scene.frame_count, fps=scene.fps, progress=progress).positions
@@ -97,14 +88,12 @@ def _save(
         return document
     _save_fields(folder.path / "refine.npz", result)
     if changed:
-        _keep_identified_twin(folder.path)
         _delete_artefacts_of_twin(folder)
-        new.save(folder.path)
+        save_refined(folder.path, new)
         Rollout(rollouts["after"], scene.times).save(folder.rollout)
-    elif (folder.path / BEFORE).is_file():  # an earlier refine had accepted something that this one does not
+    elif (folder.path / IDENTIFIED_FILE).is_file():  # an earlier refine had accepted something that this one does not
         _delete_artefacts_of_twin(folder)
-        twin.save(folder.path)
-        (folder.path / BEFORE).unlink()
+        restore_identified(folder.path)
     write_json(folder.path / "refine.json", document)
     _report(folder, scene, dynamic, progress)
     return document
@@ -196,13 +185,3 @@ def _save_fields(path: Path, result: Refined) -> None:
         times=np.arange(1, len(result.before[0]) + 1) / (problem.samples * problem.scene.fps),
         fitted=observation.fit_count,
     )
-
-
-def _keep_identified_twin(run: Path) -> None:
-    """Keep twin.yaml as identify made it. A second refine keeps the first one's copy."""
-    if (run / BEFORE).is_file():
-        return
-    shutil.copyfile(run / "law.safetensors", run / LAW_BEFORE)
-    document = yaml.safe_load((run / "twin.yaml").read_text(encoding="utf-8"))
-    document["law"]["file"] = LAW_BEFORE
-    write_yaml(run / BEFORE, document)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,8 +11,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.effects.catalogue import effect_named
 from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
 from masiv.inference.model_fit import ModelFit
-from masiv.models.families import law_of
-from masiv.models.free_body import Simulation, effect_parameters, initial_state_of
+from masiv.models.free_body import Simulation
 from masiv.models.prepare import video_observation
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import Observed, first_frames
@@ -23,7 +21,8 @@ from masiv.refine.config import RefineConfig
 from masiv.refine.experiment_design import Proposal, propose
 from masiv.refine.search import SearchResult, search_effects
 from masiv.scene.scene import Scene
-from masiv.twin import Twin, TwinEffect
+from masiv.simulation.fitted_twin import fitted_twin
+from masiv.twin import Twin
 from masiv.workers import Workers, process_count
 
 COMPETITORS = {
@@ -111,32 +110,7 @@ def refine(
         return Refined(result, simulation, result.before.fields, (result.gap or result.after).fields, proposal)
 
 
-def twin_of(fitted: ModelFit, throw: Throw, simulation: Simulation, old: Twin) -> Twin:
-    """``old`` with the law, throw, ground and effects of ``fitted``."""
-    observation = simulation.observations[0]
-    motion = initial_state_of(fitted.values, observation)
-    axes = observation.problem.axes
-    law = law_of(fitted.model.family, fitted.values)
-    law.stderr = {n: fitted.stderr[n] for n in law.values if math.isfinite(fitted.stderr.get(n, math.inf))}
-    effects = tuple(
-        TwinEffect(
-            name,
-            {p.name.split(".")[1]: fitted.values[p.name] for p in effect_parameters(name)},
-            {p.name.split(".")[1]: _known(fitted.stderr.get(p.name, math.inf)) for p in effect_parameters(name)},
-        )
-        for name in fitted.model.effects
-    )
-    return replace(
-        old,
-        velocity=axes.vectors_to_world(motion.velocity.double().numpy()),
-        omega=axes.vectors_to_world(motion.omega.double().numpy()),
-        ground=motion.ground(throw.scene.ground),
-        contact=fitted.model.contact,
-        law=law,
-        effects=effects,
-        fit={**old.fit, "refined": {"fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}},
-    )
-
-
-def _known(error: float) -> float | None:
-    return error if math.isfinite(error) else None
+def refined_twin(twin: Twin, fitted: ModelFit, simulation: Simulation) -> Twin:
+    """``twin`` with the law, the starts, the ground and the effects of ``fitted``."""
+    errors = {"fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}
+    return fitted_twin(twin, fitted, simulation, {**twin.fit, "refined": errors})

@@ -21,7 +21,8 @@ from masiv.refine.pooling import GroupRefined, unlike
 from masiv.refine.rounds import Round, like_accepted
 from masiv.refine.search import DISCREPANCY_FORCE
 from masiv.refine.summary import ADDED, NOTHING, UNEXPLAINED
-from masiv.refine.tracks_stage import Refined, place_of, run_errors
+from masiv.refine.tracks_stage import Refined, run_errors
+from masiv.simulation.fitted_twin import place_of
 
 Found = Refined | GroupRefined
 

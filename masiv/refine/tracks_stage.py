@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from masiv.config import Config
 from masiv.errors import InputError, MasivError
 from masiv.identify.tracks import conditions, family_of, fit_law, only_body, ratio_of, runs_of, simulation_of
 from masiv.inference.model_fit import ModelFit, gauss_newton_fit, ordered, rms_mm
+from masiv.materials.classical import ClassicalLaw
 from masiv.models.clamped_body import BodyRun, BodySimulation
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import Model
@@ -20,8 +21,10 @@ from masiv.models.point_mass import RIGID, PointRun, PointSimulation, point_runs
 from masiv.progress import Progress, silent
 from masiv.refine.pooling import GroupRefined, baseline, refine_group
 from masiv.refine.search import SearchResult, search_effects
+from masiv.simulation.fitted_twin import effect_values, fitted_twin, law_values, start_values
 from masiv.tracks.tracks import Tracks
-from masiv.tracks.twin import RIGID_KIND, TracksTwin, found_effect, law_parameters, starts_of
+from masiv.twin import Twin
+from masiv.twin.from_tracks import twin_of_tracks
 
 AUTO = ("neo_hookean", "von_mises")
 """Laws that compete where none is named."""
@@ -66,7 +69,7 @@ def group_of(tracks: Tracks) -> str | None:
 
 def identify_tracks(
     tracks: Tracks, config: Config, *, folder: Path | None = None, progress: Progress = silent
-) -> tuple[TracksTwin, list[ModelFit]]:
+) -> tuple[Twin, list[ModelFit]]:
     """The law that explains the runs of the first condition best, and the fits that competed, best first.
 
     Bodies that fly free are rigid: there is nothing to fit but their starts. Raises InputError for a law that has no
@@ -77,8 +80,7 @@ def identify_tracks(
         if group is not None:
             simulation = PointSimulation(tracks, point_runs(tracks, group))
             fitted = baseline(simulation)
-            twin = TracksTwin(RIGID_KIND, {}, group, starts=starts_of(fitted), fit=_errors(fitted))
-            return twin, [fitted]
+            return fitted_twin(described_twin(tracks, config), fitted, simulation, _errors(fitted)), [fitted]
         kinds = _kinds(config.identify.law)
         body = only_body(tracks)
         known = ratio_of(body, config.tracks)
@@ -99,10 +101,15 @@ def identify_tracks(
         fits = ordered(fits)
         best = fits[0]
         mine = known if "poissons_ratio" in law_names(best.model.family.kind) else {}
-        twin = TracksTwin(
-            best.model.family.kind, law_parameters(best, mine), None, starts=starts_of(best), fit=_errors(best)
-        )
-        return twin, fits
+        simulation = simulation_of(
+            tracks, condition, config.tracks, config.simulator, known=mine, folder=folder
+        )  # fmt: skip
+        return fitted_twin(described_twin(tracks, config), best, simulation, _errors(best)), fits
+
+
+def described_twin(tracks: Tracks, config: Config) -> Twin:
+    """What the scene says of its bodies and of how they start, without what is fitted. Raises InputError."""
+    return twin_of_tracks(tracks, config.tracks, config.simulator, rigid=group_of(tracks) is not None)
 
 
 def law_names(kind: str) -> set[str]:
@@ -123,54 +130,57 @@ def _errors(fitted: ModelFit) -> dict[str, float | None]:
     return {"fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}
 
 
-def simulated(tracks: Tracks, twin: TracksTwin, config: Config, condition: str | None = None) -> TwinSimulation:
+def simulated(tracks: Tracks, twin: Twin, config: Config, condition: str | None = None) -> TwinSimulation:
     """``twin`` over the runs of ``condition`` (None: the first)."""
-    if twin.group is not None:
-        points = PointSimulation(tracks, point_runs(tracks, twin.group))
-        terms = [(e, points.made(e.effect, e.bodies)) for e in twin.effects]
-        model = Model(RIGID, "none", tuple(term.name for _, term in terms))
-        values = {f"{term.name}.{n}": v for e, term in terms for n, (v, _, _) in e.parameters.items()}
-        return TwinSimulation(points, model, {**twin.starts, **values})
-    condition = conditions(tracks)[0] if condition is None else condition
-    law = twin.law_values()
-    simulation = simulation_of(tracks, condition, config.tracks, config.simulator, known=law)
-    acting = twin.of(condition)
+    group = group_of(tracks)
+    if group is not None:
+        points = PointSimulation(tracks, point_runs(tracks, group))
+        terms = [(e, points.made(e.name, e.bodies).name) for e in twin.effects]
+        values = {n: v for e, term in terms for n, v in effect_values(e, term).items()}
+        return TwinSimulation(
+            points, Model(RIGID, "none", tuple(term for _, term in terms)), {**start_values(twin), **values}
+        )
+    twin = twin.in_condition(condition)
+    law = law_values(twin)
+    simulation = simulation_of(tracks, twin.conditions[0], config.tracks, config.simulator, known=law)
     model = Model(
-        family_of(twin.law, only_body(tracks).density or 1e3, law),
+        family_of(twin.law.kind, only_body(tracks).density or 1e3, law),
         "sticky" if simulation.ground else "none",
-        tuple(e.effect for e in acting),
+        tuple(e.name for e in twin.effects),
     )
-    values = {f"{e.effect}.{n}": v for e in acting for n, (v, _, _) in e.parameters.items()}
-    return TwinSimulation(simulation, model, {**twin.starts, **values})
+    values = {n: v for e in twin.effects for n, v in effect_values(e, e.name).items()}
+    return TwinSimulation(simulation, model, {**start_values(twin), **values})
 
 
 def refine_tracks(
-    tracks: Tracks, twin: TracksTwin, config: Config, *, condition: str | None = None, dry_run: bool = False,
+    tracks: Tracks, twin: Twin, config: Config, *, condition: str | None = None, dry_run: bool = False,
     folder: Path | None = None,
     progress: Progress = silent,
 ) -> Refined | GroupRefined:  # fmt: skip
     """What do the runs of ``condition`` lack? In the first condition the law is fitted with the effects; in others it
     and the effects already known are as the twin says. Raises InputError where no run is held out."""
     with runtime.torch_threads(1):
-        if twin.group is not None:
+        group = group_of(tracks)
+        if group is not None:
             if condition is not None:
                 raise InputError("--condition is for runs of one body: bodies in flight are refined together")
-            return refine_group(tracks, twin.group, config.refine, dry_run=dry_run, progress=progress)
+            return refine_group(tracks, group, config.refine, dry_run=dry_run, progress=progress)
         first = conditions(tracks)[0]
         condition = first if condition is None else condition
         if not any(run.purpose == "hold_out" for run in runs_of(tracks, condition)):
             raise InputError(f"{tracks.path}: no run to judge by: give one of its runs `use: hold_out`")
-        law = twin.law_values()
-        values = {**law, **twin.starts}
+        law = law_values(twin)
+        values = {**law, **start_values(twin)}
         effects: tuple[str, ...] = ()
         if condition == first:
-            known = {n: v for n, v in law.items() if twin.parameters[n][2] is None}
+            assert isinstance(twin.law, ClassicalLaw)
+            known = {n: v for n, v in law.items() if n not in twin.law.stderr}
         else:
-            acting = [e for e in twin.of(condition) if e.condition is None]
-            effects = tuple(e.effect for e in acting)
-            known = {**law, **{f"{e.effect}.{n}": v for e in acting for n, (v, _, _) in e.parameters.items()}}
+            acting = [e for e in twin.effects if e.condition is None]
+            effects = tuple(e.name for e in acting)
+            known = {**law, **{n: v for e in acting for n, v in effect_values(e, e.name).items()}}
         simulation = simulation_of(tracks, condition, config.tracks, config.simulator, known=known, folder=folder)
-        family = family_of(twin.law, only_body(tracks).density or 1e3, known)
+        family = family_of(twin.law.kind, only_body(tracks).density or 1e3, known)
         model = Model(family, "sticky" if simulation.ground else "none", effects)
         progress("refine: without effects", 0, 1)
         base = gauss_newton_fit(simulation, model, values, budget=config.tracks.rollouts)
@@ -184,33 +194,10 @@ def refine_tracks(
         return Refined(result, simulation, before, after, condition)
 
 
-def twin_after(twin: TracksTwin, found: Refined | GroupRefined) -> TracksTwin:
+def refined_twin(twin: Twin, found: Refined | GroupRefined) -> Twin:
     """``twin`` with what ``found`` accepted."""
-    after, simulation = found.result.after, found.simulation
-    terms = [simulation.term(n) for n in after.model.effects]
-    fit = {**twin.fit, "refined": _errors(after)}
-    if isinstance(found, GroupRefined):
-        effects = tuple(found_effect(t, after, None) for t in terms)
-        return replace(twin, effects=effects, starts={**twin.starts, **starts_of(after)}, fit=fit)
-    assert isinstance(simulation, BodySimulation)
-    new = tuple(t for t in terms if not all(p.name in simulation.known for p in t.parameters))
-    everywhere = found.condition == conditions(simulation.tracks)[0]
-    scope = None if everywhere else found.condition
-    kept = tuple(e for e in twin.effects if e.condition != scope and not (everywhere and e.condition is None))
-    effects = tuple(found_effect(t, after, scope, place_of(simulation, t.name, after)) for t in new)
-    law = law_parameters(after, {n: v for n, v in twin.law_values().items()}) if everywhere else twin.parameters
-    return replace(twin, parameters=law, effects=(*kept, *effects), starts={**twin.starts, **starts_of(after)}, fit=fit)
-
-
-def place_of(simulation: BodySimulation, name: str, fitted: ModelFit) -> tuple[float, float, float] | None:
-    """Where an effect sits, in the body's own axes [m]; None where it has no place."""
-    values = [fitted.values.get(f"{name}.{axis}") for axis in "xyz"]
-    run = simulation.observations[0]
-    placement = next(r for r in simulation.tracks.runs if r.name == run.name).placement
-    if placement is None or any(v is None for v in values):
-        return None
-    own = placement.to_own(run.body.frame.points_to_world(np.array(values, dtype=float)))
-    return float(own[0]), float(own[1]), float(own[2])
+    after = found.result.after
+    return fitted_twin(twin, after, found.simulation, {**twin.fit, "refined": _errors(after)})
 
 
 def run_errors(runs: Sequence[BodyRun | PointRun], fields: Sequence[np.ndarray]) -> list[dict]:

@@ -192,13 +192,14 @@ def motions(run: Path) -> Numbers:
 
 def twin_of_video(run: Path) -> Numbers:
     twin = loaded(run / "twin.yaml")
+    (body,), start = twin["bodies"], twin["initial_conditions"][0]
     return {
-        "law": {"kind": twin["law"]["kind"], "values": parameters(twin["law"]["parameters"])},
-        "velocity": twin["initial"]["velocity"]["value"],
-        "omega": twin["initial"]["omega"]["value"],
+        "law": {"kind": body["law"]["kind"], "values": parameters(body["law"]["parameters"])},
+        "velocity": start["velocity"]["value"],
+        "omega": start["omega"]["value"],
         "ground": twin["boundary"]["ground"]["height"]["value"],
         "contact": twin["boundary"]["contact"],
-        "volume": twin["body"]["volume"]["value"],
+        "volume": body["volume"]["value"],
         "effects": {e["effect"]: list(parameters(e["parameters"]).values()) for e in twin["effects"]},
     }
 
@@ -277,10 +278,15 @@ def evaluation(run: Path) -> Numbers:
 def twin_of_tracks(run: Path) -> Numbers:
     twin = loaded(run / "twin.yaml")
     starts: dict[str, list[float]] = {}
-    for name, value in twin["starts"].items():
-        starts.setdefault(name.split("@")[1], []).append(value)
+    for start in twin["initial_conditions"]:
+        if start["release"] is None:  # a ball: its height alone is measured
+            place, velocity = start["placement"]["translation"], start["velocity"]
+            starts[start["observation"]] = [place["value"][1], velocity["value"][1]]
+        elif start["release"]["offsets"]:
+            starts[start["observation"]] = [offset["value"] for offset in start["release"]["offsets"].values()]
+    law = twin["bodies"][0]["law"] or {"kind": "rigid", "parameters": {}}
     return {
-        "law": {"kind": twin["law"]["kind"], "values": parameters(twin["law"]["parameters"])},
+        "law": {"kind": law["kind"], "values": parameters(law["parameters"])},
         "starts": starts,
         "effects": [
             {
