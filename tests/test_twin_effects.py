@@ -27,7 +27,7 @@ from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.simulator import Simulator
 from masiv.pipeline import Overrides, open_run
 from masiv.report.page import Page
-from masiv.report.report import _effects_section
+from masiv.report.sections.twin import effects_table
 from masiv.runfolder import STAGES
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.force import ForcePulse
@@ -307,9 +307,9 @@ def test_the_command_leaves_effects_out(tmp_path, monkeypatch, capfd):
 
 def test_the_report_lists_effects(tmp_path):
     page = Page("twin")
-    _effects_section(page, twin())
+    effects_table(page, twin())
     assert page.parts == []
-    _effects_section(page, twin(DRAG, LATE))
+    effects_table(page, twin(DRAG, LATE))
     text = "".join(page.parts)
     for part in ("linear drag", "rate", "3", "1/s", "0.1", "delay", "0.011", "–"):
         assert f">{part}<" in text

@@ -184,7 +184,7 @@ class TracksRun(Run):
         report.html. Returns the errors of each run."""
         from masiv.identify.twin_over_runs import run_errors, simulated
         from masiv.refine.document import with_scopes
-        from masiv.report.tracks_page import write_page
+        from masiv.report.tracks import write_report
         from masiv.twin.identified import IDENTIFIED_FILE, load_identified
 
         twins = {"before": twin}
@@ -216,7 +216,7 @@ class TracksRun(Run):
         )
         files = [self.path / f"{refine_stem(c, self._conditions[0])}.json" for c in self._conditions]
         refined = [with_scopes(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
-        write_page(self.folder.report, self.tracks, twin, errors, curves, refined)
+        write_report(self.folder.report, self.tracks, twin, errors, curves, refined)
         return errors
 
 
