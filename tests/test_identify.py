@@ -73,7 +73,7 @@ def seen(taichi, body):
     law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
     truth = Twin.of_body(
         positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
-        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(split=1),
+        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(subparticles=1),
     )  # fmt: skip
     motion = simulate(truth, frames=FRAMES + 4)
     return Seen(motion.positions[:FRAMES], motion.times[:FRAMES], 0.064), motion.positions

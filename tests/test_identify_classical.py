@@ -32,7 +32,7 @@ def body():
 def filmed(body, law):
     truth = Twin.of_body(
         positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
-        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(split=1),
+        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(subparticles=1),
     )  # fmt: skip
     motion = simulate(truth, frames=FRAMES)
     noise = np.random.default_rng(0).normal(0, 1e-3, motion.positions.shape).astype(np.float32)

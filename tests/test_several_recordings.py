@@ -44,8 +44,8 @@ def dropped(taichi, body):  # noqa: F811
     """Another recording of the body of ``seen``."""
     truth = Twin.of_body(
         positions=body, velocity=DROP, omega=-OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
-        volume=0.064, density=1000.0, up=UP, fps=FPS,
-        law=ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3), simulator=SimulatorConfig(split=1),
+        volume=0.064, density=1000.0, up=UP, fps=FPS, simulator=SimulatorConfig(subparticles=1),
+        law=ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3),
     )  # fmt: skip
     motion = simulate(truth, frames=FRAMES - 1)  # one frame fewer: films differ in length
     return Seen(motion.positions, motion.times, 0.064)

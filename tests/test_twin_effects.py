@@ -42,7 +42,7 @@ SIDE, FPS = 0.3, 24.0
 UP = np.array([0.0, 1.0, 0.0])
 GRAVITY = -9.8 * UP
 LAW = ClassicalLaw("neo_hookean", youngs_modulus=2e4, poissons_ratio=0.3)
-CONFIG = SimulatorConfig(split=1, grid_nodes=1 << 15, memory_mb=200)
+CONFIG = SimulatorConfig(subparticles=1, grid_nodes=1 << 15, memory_mb=200)
 DRAG = TwinEffect("linear_drag", {"rate": 3.0}, {"rate": 0.1})
 LATE = TwinEffect("time_offset", {"delay": 0.011})
 HIGH = TwinEffect("ground_height", {"height": 0.07})
