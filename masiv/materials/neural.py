@@ -77,7 +77,7 @@ class NeuralLaw(Law):
         beside the relaxation time it is Newtonian, of viscosity shear modulus x relaxation time [Pa s]."""
         law = cls.of_moduli(shear_modulus=shear_modulus, bulk_modulus=bulk_modulus, width=width, seed=seed)
         rate = LOG_RATE_RANGE * math.atanh(-math.log(relaxation_time) / LOG_RATE_RANGE)
-        _constant(law.plastic, (rate, -2 * LOG_RATE_RANGE))
+        _set_constant(law.plastic, (rate, -2 * LOG_RATE_RANGE))
         return law
 
     @classmethod
@@ -85,7 +85,7 @@ class NeuralLaw(Law):
         """A law whose moduli [Pa] are the same at all strains; how it flows is as the seed has it."""
         law = cls(stress_scale=shear_modulus, width=width, seed=seed)
         bulk = LOG_MODULUS_RANGE * math.atanh(math.log(bulk_modulus / shear_modulus) / LOG_MODULUS_RANGE)
-        _constant(law.elastic, (0.0, -2 * LOG_MODULUS_RANGE, bulk, 0.0))  # g2: as little as the networks can say
+        _set_constant(law.elastic, (0.0, -2 * LOG_MODULUS_RANGE, bulk, 0.0))  # g2: as little as the networks can say
         return law
 
     def scales(self) -> list[torch.nn.Parameter]:
@@ -204,11 +204,18 @@ def _network(width: int, outputs: int, generator: torch.Generator) -> torch.nn.S
     return torch.nn.Sequential(layers[0], torch.nn.GELU(), layers[1], torch.nn.GELU(), layers[2])
 
 
-def _constant(network: torch.nn.Sequential, values: tuple[float, ...]) -> None:
-    """Let ``network`` give ``values``, whatever it is given."""
+def output_layer(network: torch.nn.Sequential) -> torch.nn.Linear:
+    """The last layer of a network of a ``NeuralLaw``."""
+    layer = network[-1]
+    assert isinstance(layer, torch.nn.Linear)
+    return layer
+
+
+def _set_constant(network: torch.nn.Sequential, values: tuple[float, ...]) -> None:
+    """Let ``network`` return ``values`` for every input."""
     with torch.no_grad():
-        network[-1].weight.zero_()
-        network[-1].bias.copy_(torch.tensor(values))
+        output_layer(network).weight.zero_()
+        output_layer(network).bias.copy_(torch.tensor(values))
 
 
 def _trace(a: torch.Tensor) -> torch.Tensor:

@@ -40,8 +40,8 @@ class CameraSpec(_Part):
 class SynthSpec(_Part):
     """A synthetic multi-view scene: y up, ground at y = 0."""
 
-    shape: ShapeSpec = ShapeSpec()
-    material: MaterialSpec = MaterialSpec()
+    shape: ShapeSpec = ShapeSpec.model_validate({})
+    material: MaterialSpec = MaterialSpec.model_validate({})
     velocity: Vector = Field((0, 0, 0), description="of the centre at frame 0 [m/s]")
     omega: Vector = Field((0, 0, 0), description="spin at frame 0 [rad/s]")
     gravity: Vector = Field((0, -9.8, 0), description="[m/s^2]")
@@ -52,7 +52,7 @@ class SynthSpec(_Part):
     )
     frames: int = Field(12, ge=2)
     fps: float = Field(24.0, gt=0)
-    cameras: CameraSpec = CameraSpec()
+    cameras: CameraSpec = CameraSpec.model_validate({})
     texture: Literal["noise", "stripes", "patches"] = "noise"
     image_noise: float = Field(1.5, ge=0, description="standard deviation, of 255")
     supersampling: Annotated[int, Field(ge=1, le=8)] = 3
