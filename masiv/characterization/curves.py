@@ -104,7 +104,7 @@ def _free_sides(law: Law, state: torch.Tensor, step: float, dt: float) -> tuple[
     """The state (1, 3, 3) and stress (3, 3) after an axial strain ``step`` whose side stress is zero.
 
     Regula falsi (Illinois). Without a change of sign, as of a heap that carries nothing sideways, the side is let go
-    where its stress is least.
+    at its least stress.
     """
 
     def tried(side: float) -> tuple[float, torch.Tensor, torch.Tensor]:

@@ -47,7 +47,7 @@ class Quantity:
 class Material:
     """A law in a tester's terms: behaviour in words, quantities by name, families nearest first, and curves.
 
-    error_mm: of the fit [mm]. curves: name -> strain, stress_pa, family_pa (of the nearest family), observed (low, high).
+    error_mm: of the fit [mm]. curves: name -> strain, stress_pa, family_pa (nearest family), observed (low, high).
     """
 
     behaviour: str

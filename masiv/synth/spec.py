@@ -27,7 +27,7 @@ class MaterialSpec(_Part):
 
 
 class CameraSpec(_Part):
-    """Cameras evenly round the body, at heights that alternate."""
+    """Cameras evenly around the body, at alternating heights."""
 
     count: int = Field(11, ge=2, le=200)
     size: int = Field(128, ge=16, le=2048, description="side of the square pictures [pixels]")
@@ -48,7 +48,7 @@ class SynthSpec(_Part):
     contact: Literal["sticky", "release", "slip"] = "sticky"
     friction: float = Field(0.0, ge=0, description="Coulomb's coefficient of contact slip")
     effects: dict[str, dict[str, float]] = Field(
-        {}, description="of masiv.effects, by name, with their parameters: simulated, but told only in truth.yaml"
+        {}, description="of masiv.effects, by name, with their parameters: simulated, but declared only in truth.yaml"
     )
     frames: int = Field(12, ge=2)
     fps: float = Field(24.0, gt=0)
@@ -62,7 +62,7 @@ class SynthSpec(_Part):
 
 
 def read_spec(path: Path) -> SynthSpec:
-    """The spec in a YAML file. Raises InputError, naming the nearest known key, where something is wrong with it."""
+    """The spec in a YAML file. Raises InputError, with the nearest known key, if something is wrong with it."""
     spec = validated(SynthSpec, read_yaml(path), str(path))
     mesh = spec.shape.mesh
     if mesh is None:
