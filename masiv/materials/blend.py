@@ -43,9 +43,9 @@ def blend(first: Law, second: Law, weight: float) -> Law:
 class BlendedLaw(Law):
     """Two neural laws: flow rates r = r_1^(1 - w) r_2^w, stresses (1 - w) tau_1 + w tau_2.
 
-    Rates are decades apart (e^-14 of an elastic body, e^14 per second of a fluid), so they are blended geometrically. In
-    steady flow the elastic strain of a law is inversely proportional to its rate. So the law that flows faster than the
-    blend is evaluated at the fraction min(1, r / r_i) of the strain: it would never have reached all of it. Both laws
+    Rates are decades apart (e^-14 of an elastic body, e^14 per second of a fluid), so they are blended geometrically.
+    In steady flow the elastic strain of a law is inversely proportional to its rate. So the law that flows faster than
+    the blend is evaluated at the fraction min(1, r / r_i) of the strain: it would never have reached all of it. Both laws
     are at rest at F = I, isotropic and frame indifferent, with positive moduli, and so is the blend; it does not depend
     on the substep either. Forward only.
     """
