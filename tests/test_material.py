@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from masiv.characterization import curves
-from masiv.characterization.describe import Quantity, describe, describe_twin, paragraph, said
+from masiv.characterization.describe import Quantity, describe, describe_twin, formatted, paragraph
 from masiv.characterization.excitation import Excited, excited_range, perturbed, sensitivities
 from masiv.errors import InputError, NonFiniteError
 from masiv.materials.classical import ClassicalLaw
@@ -263,7 +263,7 @@ def test_a_twin_is_described_with_errors_saved_and_reported(taichi, tmp_path):
 
 
 def test_quantities_are_said_with_fitting_units():
-    assert said(Quantity(12345.0, "Pa", stderr_percent=14.2)) == "12.3 kPa ± 14 %"
-    assert said(Quantity(2e6, "Pa", "under pressure")) == "2 MPa (under pressure)"
-    assert said(Quantity(None, "Pa")) == "none"
-    assert said(Quantity(0.3, "", stderr_percent=250.0)) == "0.3 ± more than 100 %"
+    assert formatted(Quantity(12345.0, "Pa", stderr_percent=14.2)) == "12.3 kPa ± 14 %"
+    assert formatted(Quantity(2e6, "Pa", "under pressure")) == "2 MPa (under pressure)"
+    assert formatted(Quantity(None, "Pa")) == "none"
+    assert formatted(Quantity(0.3, "", stderr_percent=250.0)) == "0.3 ± more than 100 %"
