@@ -34,7 +34,7 @@ from masiv.continuum.trajectory import Trajectory
 from masiv.identify.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.metrics import chamfer_floor
-from masiv.models.initial_motion import estimate_initial_motion
+from masiv.models.initial_state import estimate_initial_motion
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing
 from masiv.observations.read import read_scene

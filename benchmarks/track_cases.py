@@ -16,14 +16,14 @@ from unknown_effects import UNKNOWN
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
 from masiv.scene.scene import Ground, Scene
 from masiv.shapes import ShapeSpec, make_body
-from masiv.simulation.simulate import rigid_initial_state
 
 FPS = 24.0
 

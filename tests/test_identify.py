@@ -14,8 +14,8 @@ from masiv.identify.stage import identify
 from masiv.identify.start import DIVERGED, STIFFEST, Start, _error, best_first
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
-from masiv.models.initial_motion import estimate_initial_motion
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState, estimate_initial_motion
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Ground, Scene

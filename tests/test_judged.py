@@ -10,8 +10,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.identify import baseline
 from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.judged import nearest_first, picture_errors_of
-from masiv.models.families import initial_state_parameters
-from masiv.models.problem import InitialState
+from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.workers import Workers
 
 TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
@@ -19,7 +18,7 @@ WRONG = {"viscosity": 40.0, "bulk_modulus": 1e5}
 
 
 def fitted(problem, kind, values, mean_square):
-    throw = initial_state_parameters(problem, InitialState.of_world(problem.axes, VELOCITY, OMEGA))
+    throw = initial_state_parameters(InitialState.of_world(problem.axes, VELOCITY, OMEGA), problem.ground_range)
     every = {**values, **{p.name: p.start for p in throw}}
     return FamilyFit(kind, "sticky", every, mean_square=mean_square, samples=100)
 

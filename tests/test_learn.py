@@ -10,7 +10,8 @@ from masiv.identify.fit import Fit
 from masiv.identify.start import Start
 from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import silent
 

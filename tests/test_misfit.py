@@ -11,8 +11,8 @@ from masiv.checkpoint import Checkpoint
 from masiv.identify.classical_fit import fit_all_particles, fit_family, fit_further, search
 from masiv.identify.misfit import Misfit
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.families import FAMILIES, initial_state_parameters
-from masiv.models.problem import InitialState
+from masiv.models.families import FAMILIES
+from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.progress import silent
 
 TRUE = {"youngs_modulus": 3e4, "poissons_ratio": 0.3}
@@ -21,7 +21,7 @@ DRIFT = np.array([0.25, 0.0, 0.0])
 
 
 def values_of(problem, **changes):
-    throw = initial_state_parameters(problem, InitialState.of_world(problem.axes, VELOCITY, OMEGA))
+    throw = initial_state_parameters(InitialState.of_world(problem.axes, VELOCITY, OMEGA), problem.ground_range)
     return {**TRUE, **{p.name: p.start for p in throw}, **changes}
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from masiv.errors import MasivError, NonFiniteError
-from masiv.inference.least_squares import Parameter, fit_parameters
+from masiv.inference.least_squares import fit_parameters
+from masiv.models.parameters import Parameter
 
 TIMES = np.linspace(0, 2, 200)
 

@@ -17,7 +17,8 @@ from masiv.identify.pictures import some_of_each
 from masiv.identify.stage import identify
 from masiv.identify.throw import Throw
 from masiv.materials.load import load_law
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Frame

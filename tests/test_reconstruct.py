@@ -120,6 +120,7 @@ def result(scene, tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_material_points_are_followed(result):
     unit, _ = ball()
     start = torch.tensor(truth(unit, 0)).float()
@@ -133,6 +134,7 @@ def test_material_points_are_followed(result):
         assert frame < 3 or error < 0.8 * np.linalg.norm(expected - expected.mean(axis=0), axis=1).mean()
 
 
+@pytest.mark.slow
 def test_a_spin_that_no_outline_shows_is_followed():
     """From the first frame on: where points or colours may slide over the surface, half of it is lost there."""
     found = reconstruct(filmed(spun), CONFIG, seed=4, checkpoint=Checkpoint(None), progress=silent)
@@ -144,6 +146,7 @@ def test_a_spin_that_no_outline_shows_is_followed():
     assert np.linalg.norm(turn - SPIN) < 0.3 * np.linalg.norm(SPIN)
 
 
+@pytest.mark.slow
 def test_a_view_held_out_is_predicted(scene, result):
     for frame in (0, 3):
         picture, camera = scene.frame(3, frame), scene.cameras[3]
@@ -155,6 +158,7 @@ def test_a_view_held_out_is_predicted(scene, result):
         assert -10 * np.log10(((drawn - target)[box] ** 2).mean()) > 20, frame
 
 
+@pytest.mark.slow
 def test_resumed_run_ends_with_the_same_numbers(scene, result, tmp_path):
     part = scene.restricted(holdout_cameras=(3,))
     checkpoint = Checkpoint(tmp_path / "state.pt", every_s=0.0)
@@ -202,6 +206,7 @@ def test_two_processes_end_with_the_numbers_of_one(scene, tmp_path):
     assert same(whole, reconstruct(scene, two, seed=4, checkpoint=Checkpoint(None), progress=silent))
 
 
+@pytest.mark.slow
 def test_a_second_process_that_dies_is_told_of_and_none_is_left(scene, monkeypatch):
     started = []
 

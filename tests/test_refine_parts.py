@@ -13,11 +13,11 @@ from test_workers import small_simulation
 
 from masiv.errors import MasivError
 from masiv.inference.discretization import with_grid_errors, with_residual_std
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, best_strength, column, gauss_newton_jump, strengths_alone
 from masiv.models.base import EffectTerm, WeightedResidual
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import Model, Simulation
+from masiv.models.parameters import Parameter
 from masiv.refine import second_effect
 from masiv.refine.add_effect import absent
 from masiv.refine.candidates import score

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import gauss_newton_fit, robust_cost
 from masiv.models.base import EffectTerm, WeightedResidual
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 from masiv.refine.add_effect import refit
 from masiv.refine.candidates import score
 

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from masiv.inference.least_squares import Parameter
 from masiv.models.base import EffectTerm
+from masiv.models.parameters import Parameter
 from masiv.refine import add_effect, second_effect
 from masiv.refine import search as loop
 from masiv.refine.config import RefineConfig

@@ -6,8 +6,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
-from masiv.inference.noise_floor import noise_floor
+from masiv.effects.context import EffectContext
+from masiv.observations.noise_floor import noise_floor
 from masiv.rigid import ballistic_positions, beyond_rigid, beyond_uniform, free_flight, impact_point, turned_freely
 
 GRAVITY = np.array([0.0, -9.8, 0.0])

@@ -20,7 +20,8 @@ from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState, rigid_initial_state
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.simulator import Simulator
@@ -29,7 +30,7 @@ from masiv.report.page import Page
 from masiv.report.report import _effects_section
 from masiv.runfolder import STAGES
 from masiv.scene.scene import Ground, Scene
-from masiv.simulation.simulate import Push, march, rigid_initial_state, simulate
+from masiv.simulation.simulate import Push, march, simulate
 from masiv.simulation.twin_effects import active_effects, body_mass, lowered
 from masiv.simulation.variation import with_body_of, with_density, with_ground
 from masiv.twin import Twin, TwinEffect
@@ -132,7 +133,7 @@ def test_a_push_moves_what_is_added_to_the_mass_too():
     assert body_mass(replace(heavy, effects=())) == pytest.approx(27)
     path = simulate(heavy, frames=6, push=Push(np.array([81.0, 0, 0]))).positions
     held = heavy.positions.astype(float)
-    radius = active_effects(heavy, frames=2, fps=FPS).setting.size / 8
+    radius = active_effects(heavy, frames=2, fps=FPS).context.size / 8
     share = np.exp(-0.5 * ((held - held.mean(0)) ** 2).sum(1) / radius**2)
     weight = 27 / len(held) + 13.5 * share / share.sum()
     centre = (path[:, :, 0] * weight).sum(1) / weight.sum()

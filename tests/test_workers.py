@@ -21,8 +21,9 @@ from masiv.identify.config import IdentifyConfig
 from masiv.identify.start import _effort, choose_start
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import Model, Simulation, parameters
+from masiv.models.initial_state import InitialState
 from masiv.models.prepare import video_observation
-from masiv.models.problem import InitialState, Problem
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import DONE, baselines, derived
@@ -210,6 +211,7 @@ def test_as_many_as_asked_or_as_there_are_cores():
     assert 1 <= process_count(0) <= 4
 
 
+@pytest.mark.slow
 def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.identify.start.MODULI", (1e4, 3e4))
     monkeypatch.setattr("masiv.identify.start.REFINED", 2)
@@ -253,6 +255,7 @@ def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
     assert fitted.model.contact == "sticky"
 
 
+@pytest.mark.slow
 def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
     simulation, _ = small_simulation()

@@ -24,7 +24,8 @@ from masiv.identify.polish import wanted
 from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.models.families import FAMILIES
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
 from masiv.workers import TaskError, Workers, process_count
 

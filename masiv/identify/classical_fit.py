@@ -18,26 +18,12 @@ from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.misfit import Misfit
 from masiv.identify.objective import objective
 from masiv.inference.correlation import effective_samples
-from masiv.inference.least_squares import (
-    FIRST_STEP,
-    Estimate,
-    Parameter,
-    covariance,
-    fit_parameters,
-    robust_cost,
-    robust_weight,
-)
+from masiv.inference.least_squares import FIRST_STEP, Estimate, covariance, fit_parameters, robust_cost, robust_weight
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.families import (
-    FAMILIES,
-    Family,
-    Rollouts,
-    initial_state_from,
-    initial_state_parameters,
-    law_of,
-    mean_distance,
-)
-from masiv.models.problem import InitialState, Problem
+from masiv.models.families import FAMILIES, Family, Rollouts, law_of, mean_distance
+from masiv.models.initial_state import InitialState, initial_state_parameters
+from masiv.models.parameters import Parameter
+from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 RECONSIDERED = 3
@@ -75,7 +61,7 @@ class FamilyFit:
 
     @property
     def motion(self) -> InitialState:
-        return initial_state_from(self.values)
+        return InitialState.of_values(self.values)
 
     def state(self) -> dict[str, Any]:
         """Plain values, as a checkpoint keeps them."""
@@ -89,7 +75,7 @@ def search(problem: Problem, family: Family, motion: InitialState, progress: Pro
     contacts = ["sticky", "release"] if problem.config.contact == "auto" else [problem.config.contact]
     if problem.scene.ground is None:
         contacts = ["none"]
-    throw = {p.name: p.start for p in initial_state_parameters(problem, motion)}
+    throw = {p.name: p.start for p in initial_state_parameters(motion, problem.ground_range)}
     candidates = family.candidates()
     extra = (len(contacts) - 1) * min(RECONSIDERED, len(candidates))
     found: list[tuple[float, int, str, float]] = []
@@ -277,7 +263,7 @@ def ranked(fits: list[FamilyFit]) -> list[FamilyFit]:
 
 
 def _parameters(problem: Problem, family: Family, found: FamilyFit) -> list[Parameter]:
-    both = [*family.parameters, *initial_state_parameters(problem, found.motion)]
+    both = [*family.parameters, *initial_state_parameters(found.motion, problem.ground_range)]
     return [replace(p, start=float(np.clip(found.values[p.name], p.lower, p.upper))) for p in both]
 
 

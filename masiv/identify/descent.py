@@ -12,7 +12,7 @@ from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import InitialState
+from masiv.models.initial_state import InitialState
 
 FAILURES_ALLOWED = 8
 RECOVERY = 1.4

@@ -21,7 +21,8 @@ from masiv.identify.pictures import compared, picture_errors, picture_objective
 from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 
@@ -85,7 +86,7 @@ def fit(
                 frames = min(descent.reach, _horizon(i, config.iterations, throw.first_frames, throw.problem.frames))
                 departure = torch.zeros(())
                 if isinstance(law, NeuralLaw) and isinstance(start, NeuralLaw) and config.prior_weight:
-                    departure = config.prior_weight * law.departure(start)
+                    departure = config.prior_weight * law.prior_distance(start)
                 passed.append(
                     _descend(throw.problem, law, motion, contact, frames, departure, 1 / len(throws), (seed, i, k))
                 )

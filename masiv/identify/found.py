@@ -7,7 +7,7 @@ from typing import Any
 
 from masiv.identify.fit import Fit
 from masiv.materials.law import Law
-from masiv.models.problem import InitialState
+from masiv.models.initial_state import InitialState
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ import torch
 from scipy.optimize import brentq
 
 from masiv.materials.law import Law
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 from masiv.splat.rasteriser import Rendering, render

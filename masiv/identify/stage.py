@@ -15,7 +15,8 @@ from masiv.identify.baseline import identify_classical
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.learn import learn
 from masiv.identify.throw import Throw, throw_of
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene

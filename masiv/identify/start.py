@@ -17,7 +17,8 @@ from masiv.identify.objective import objective
 from masiv.identify.pictures import compared
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.pretraining.pretrain import MATERIALS, pretrained_path
 from masiv.progress import Progress
 from masiv.workers import Workers, unwrap

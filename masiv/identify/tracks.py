@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from masiv.errors import InputError, MasivError, NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, gauss_newton_fit, rms_mm
 from masiv.models.clamped_body import BodySimulation, body_run, shortened
 from masiv.models.families import FAMILIES, Family
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress
 from masiv.tracks.config import TracksConfig

@@ -10,9 +10,10 @@ import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.inference.correlation import effective_samples
-from masiv.inference.least_squares import FIRST_STEP, Parameter, covariance, fit_parameters, robust_weight
+from masiv.inference.least_squares import FIRST_STEP, covariance, fit_parameters, robust_weight
 from masiv.models.base import ForwardModel, Observation
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 
 LEAST_GAIN = 1e-3
 MULTIPLES = (0.25, 1.0, 4.0)

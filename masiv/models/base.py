@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
-from masiv.inference.least_squares import Parameter
+from masiv.models.parameters import Parameter
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from masiv.effects.effect import EffectContext
+    from masiv.effects.context import EffectContext
     from masiv.inference.model_fit import ModelFit
     from masiv.models.free_body import Model
     from masiv.refine.config import RefineConfig
@@ -61,7 +61,7 @@ def plain_term(name: str, setting: EffectContext) -> EffectTerm:
     units = {f"{name}.{p.name}": p.unit for p in effect.parameters}
     cut = effect.strengths
     guesses = tuple(tuple(g) for g in effect.guesses(setting))
-    return EffectTerm(name, name, own[:cut], own[cut:], guesses, units, nonsmooth=effect.nonsmooth)
+    return EffectTerm(name, name, own[:cut], own[cut:], guesses, units, nonsmooth=effect.hints.nonsmooth)
 
 
 class Observation(Protocol):

@@ -18,30 +18,31 @@ from scipy.interpolate import CubicSpline
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
-from masiv.effects.effect import DragBody, Effect, EffectContext, EffectParameter
+from masiv.effects.context import EffectContext, EffectParameter
+from masiv.effects.effect import ClockEffect, ContactEffect, Effect, GeometryEffect
+from masiv.effects.per_body import DragBody
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.files import write_npz
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, rms_mm
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit
-from masiv.models.cantilever_preload import across
 from masiv.models.free_body import Model
 from masiv.models.marker_body import Plan, SimulatedBody, plan, simulated_body
+from masiv.models.parameters import Parameter
 from masiv.models.point_mass import outline_of
-from masiv.models.release_fit import found_start
+from masiv.models.release import clamp_axes, fit_release
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import rollout
 from masiv.refine.config import RefineConfig
 from masiv.tracks.tracks import Run, Tracks
 
 RELEASE_REACH, RELEASE_STEP = 0.03, 1e-3
-ASIDE_REACH, ASIDE_STEP = 3e-3, 1e-4
+OFFSET_REACH, OFFSET_STEP = 3e-3, 1e-4
 FINEST_OUTPUT = 2.5e-3
 """Time [s] between two states of a rollout that are kept; motion between them is a cubic spline."""
 STABLE = 1.3
 """A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
-LIFT_REACH, LIFT_STEP = 0.2, 0.01
+DEFLECTION_REACH, DEFLECTION_STEP = 0.2, 0.01
 """In sizes of the body."""
 KEPT = 24
 LOST = 1.2
@@ -77,16 +78,28 @@ class BodyRun(WholeRunSplit):
     def starts(self) -> tuple[Parameter, ...]:
         """How much later [s] it was let go, and how far [m] from its rest it was held along two horizontal axes.
 
-        Where its first moments are left out, also how far above its rest it was held, and an effective lift [m] at the
-        start (see ``masiv.models.cantilever_preload``), for the energy that they took or gave."""
-        axes = ("aside_1", "aside_2") if not self.skip else ("aside_1", "aside_2", "above")
-        aside = (Parameter(f"{axis}@{self.name}", 0.0, -ASIDE_REACH, ASIDE_REACH, ASIDE_STEP) for axis in axes)
-        lift = () if not self.skip or across(self.body) is None else (self._lift(),)
-        return (Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP), *aside, *lift)
+        Where its first moments are left out, also how far above its rest it was held, and an effective tip deflection
+        [m] at the start (see ``static_deflection``), for the energy that they took or gave."""
+        lateral = ("lateral_offset_1", "lateral_offset_2")
+        axes = lateral if not self.skip else (*lateral, "vertical_offset")
+        offsets = (Parameter(f"{axis}@{self.name}", 0.0, -OFFSET_REACH, OFFSET_REACH, OFFSET_STEP) for axis in axes)
+        bends = self.skip and clamp_axes(self.body.gravity, self.body.normals) is not None
+        deflection = (self._tip_deflection(),) if bends else ()
+        return (
+            Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP),
+            *offsets,
+            *deflection,
+        )
 
-    def _lift(self) -> Parameter:
+    def _tip_deflection(self) -> Parameter:
         size = self.body.size
-        return Parameter(f"lift@{self.name}", 0.0, -LIFT_REACH * size, LIFT_REACH * size, LIFT_STEP * size)
+        return Parameter(
+            f"tip_deflection@{self.name}",
+            0.0,
+            -DEFLECTION_REACH * size,
+            DEFLECTION_REACH * size,
+            DEFLECTION_STEP * size,
+        )
 
 
 def body_run(
@@ -168,22 +181,24 @@ class BodySimulation(SharedRollouts):
 
     def candidates(self, model: Model) -> list[str]:
         """Effects that ``model`` lacks; a clock that is off is a release at another time, and so is fitted already."""
-        taken = not self.ground or any(effect_named(n).on_grid == "ground" for n in model.effects)
+        taken = not self.ground or any(isinstance(effect_named(n), ContactEffect) for n in model.effects)
         out = []
         for name, effect in causes().items():
-            on_ground = effect.on_grid == "ground" or name == "ground_height"
-            free = effect.needs_clamp and not len(self.observations[0].body.heights)
-            if name not in model.effects and name != "time_offset" and not (on_ground and taken) and not free:
+            on_ground = isinstance(effect, (ContactEffect, GeometryEffect))
+            clock = isinstance(effect, ClockEffect)
+            free = effect.hints.needs_clamp and not len(self.observations[0].body.heights)
+            if name not in model.effects and not clock and not (on_ground and taken) and not free:
                 out.append(name)
         return out
 
     def term(self, name: str) -> EffectTerm:
         """The effect, its steps in proportion to the body."""
         effect = effect_named(name)
-        own = [self._parameter(effect, p) for p in effect.shared or effect.parameters]
+        declared = (effect.per_body or effect).parameters
+        own = [self._parameter(effect, p) for p in declared]
         cut = effect.strengths
         guesses = tuple(tuple(g) for g in effect.guesses(self._setting(self.observations[0])))
-        units = {f"{name}.{p.name}": p.unit for p in effect.shared or effect.parameters}
+        units = {f"{name}.{p.name}": p.unit for p in declared}
         return EffectTerm(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
 
     def _parameter(self, effect: Effect, p: EffectParameter) -> Parameter:
@@ -198,20 +213,20 @@ class BodySimulation(SharedRollouts):
         elif p.unit == "m":
             step = 0.04 * size
             if p.name in "xyz":  # a place is in the body or at it
-                k, reach = "xyz".index(p.name), 0.0 if effect.inside else BESIDE * size
+                k, reach = "xyz".index(p.name), 0.0 if effect.hints.inside else BESIDE * size
                 lower, upper = float(low[k]) - reach, float(high[k]) + reach
         return Parameter(f"{effect.name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
 
     def _setting(self, run: BodyRun) -> EffectContext:
         duration = float(run.times[-1])
-        return run.body.effects((), duration=duration, frame_time=duration / (len(run.times) - 1)).setting
+        return run.body.effects((), duration=duration, frame_time=duration / (len(run.times) - 1)).context
 
     def _members(self, model: Model, values: Mapping[str, float]) -> tuple:
         out = []
         for name in model.effects:
             effect = effect_named(name)
             given = torch.tensor([values[p.name] for p in self.term(name).parameters], dtype=torch.float32)
-            out.append((effect, effect.of(given, self.outline) if effect.shared else given))
+            out.append((effect, effect.per_body.of_body(given, self.outline) if effect.per_body else given))
         return tuple(out)
 
     def law(self, model: Model, values: Mapping[str, float]) -> ClassicalLaw:
@@ -243,13 +258,13 @@ class BodySimulation(SharedRollouts):
     def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
         """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
         both = {**self.known, **values}
-        lift = values.get(f"lift@{run.name}", 0.0) if run.skip else 0.0
+        deflection = values.get(f"tip_deflection@{run.name}", 0.0) if run.skip else 0.0
         key = (
             run.name,
             float(run.times[-1]),
             model.effects,
             tuple(sorted((n, v) for n, v in both.items() if "@" not in n)),
-            *([lift] if lift else []),
+            *([deflection] if deflection else []),
         )
         if key in self.kept:
             return self.kept[key]
@@ -265,7 +280,7 @@ class BodySimulation(SharedRollouts):
             planned = self.planned(run, model, values, times)
             active = self.acting(run, model, values, last)
             self.rollouts += 1
-            state = run.body.released(planned.simulator.dtype, lift)
+            state = run.body.released(planned.simulator.dtype, deflection)
             law = self.law(model, values)
             positions = rollout(planned.simulator, law, state, planned.steps, planned.outputs, active)
         except (InputError, NonFiniteError):
@@ -301,19 +316,19 @@ class BodySimulation(SharedRollouts):
         """Markers (K, M, 3) [m, world] of the model at the run's times."""
         names = [p.name for p in run.starts]
         if not run.fitted or not all(name in values for name in names):
-            return self.found_start(run, model, values)[1]
+            return self.fit_release(run, model, values)[1]
         start = np.array([values[name] for name in names])
         path = self.path(run, model, values)
-        axes = self.across[: sum(not name.startswith(("release", "lift")) for name in names)]
+        axes = self.across[: sum(not name.startswith(("release", "tip_deflection")) for name in names)]
         return path(np.clip(run.times - start[0], 0.0, None)) + start[1 : 1 + len(axes)] @ axes
 
-    def found_start(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    def fit_release(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
         """The values of ``run.starts`` that bring it nearest to its own motion, and its markers (K, M, 3) [m]."""
 
-        def path_at(lift: float) -> CubicSpline:
-            return self.path(run, model, {**values, f"lift@{run.name}": lift})
+        def path_at(deflection: float) -> CubicSpline:
+            return self.path(run, model, {**values, f"tip_deflection@{run.name}": deflection})
 
-        return found_start(run.starts, run.times, run.observed, self.across, path_at)
+        return fit_release(run.starts, run.times, run.observed, self.across, path_at)
 
     def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
         """Simulated less observed (K, M, 3) [m, world] of each run; of a held-out run nothing but on request."""
@@ -357,7 +372,8 @@ class BodySimulation(SharedRollouts):
     def objections(self, before: ModelFit, after: ModelFit, term: EffectTerm, config: RefineConfig) -> list[str]:
         """What the medium cannot do."""
         theta = torch.tensor([after.values[p.name] for p in term.parameters], dtype=torch.float64)
-        why = effect_named(term.effect).violates_bounds(theta, self.outline)
+        per_body = effect_named(term.effect).per_body
+        why = per_body.violates_bounds(theta, self.outline) if per_body else None
         return [] if why is None else [why]
 
 

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 
 from masiv.errors import InputError, MasivError, NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.materials.classical import UNITS, ClassicalLaw
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.parameters import Parameter
+from masiv.models.problem import Problem
 
 MODULUS = Parameter("youngs_modulus", 3e4, 3e2, 1e7, 0.05, log=True)
 RATIO = Parameter("poissons_ratio", 0.3, 0.0, 0.48, 0.01)
@@ -89,28 +90,6 @@ FAMILIES = {
 }
 
 
-def initial_state_parameters(problem: Problem, motion: InitialState) -> tuple[Parameter, ...]:
-    """Velocity [m/s], spin [rad/s] and, where there is a ground, its offset [m], around ``motion``."""
-    parameters = []
-    for name, tensor, reach, step in (("velocity", motion.velocity, 3.0, 0.02), ("omega", motion.omega, 6.0, 0.05)):
-        for axis, value in zip("xyz", tensor.double().tolist(), strict=True):
-            parameters.append(Parameter(f"{name}_{axis}", value, value - reach, value + reach, step))
-    reach = problem.config.ground_range
-    if problem.scene.ground is not None and reach > 0:
-        start = float(np.clip(float(motion.ground_offset), -reach, reach))
-        parameters.append(Parameter("ground_offset", start, -reach, reach, 2e-3))
-    return tuple(parameters)
-
-
-def initial_state_from(values: dict[str, float]) -> InitialState:
-    """The throw among ``values``."""
-    return InitialState(
-        torch.tensor([values[f"velocity_{a}"] for a in "xyz"], dtype=torch.float32),
-        torch.tensor([values[f"omega_{a}"] for a in "xyz"], dtype=torch.float32),
-        torch.tensor(values.get("ground_offset", 0.0), dtype=torch.float32),
-    )
-
-
 def law_of(family: Family, values: dict[str, float]) -> ClassicalLaw:
     """The law among ``values``."""
     return ClassicalLaw(family.kind, **{p.name: values[p.name] for p in family.parameters})
@@ -143,7 +122,9 @@ class Rollouts:
             needed = self.problem.least_substeps(law)
             if needed > self.STABLE * self.steps:
                 raise NonFiniteError(0, 0, f"the law needs {needed} substeps a frame, {self.steps} are taken")
-            positions = self.problem.run(law, initial_state_from(values), self.contact, self.frames, steps=self.steps)
+            positions = self.problem.run(
+                law, InitialState.of_values(values), self.contact, self.frames, steps=self.steps
+            )
         except (InputError, NonFiniteError):
             raise
         except MasivError as failed:

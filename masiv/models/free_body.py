@@ -11,11 +11,13 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
+from masiv.effects.effect import ContactEffect
 from masiv.errors import InputError, MasivError, NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.models.base import EffectTerm, SharedRollouts, WeightedResidual, effect_parameters, plain_term
-from masiv.models.families import Family, initial_state_from, initial_state_parameters, law_of
-from masiv.models.problem import InitialState, Problem
+from masiv.models.families import Family, law_of
+from masiv.models.initial_state import InitialState, initial_state_parameters
+from masiv.models.parameters import Parameter
+from masiv.models.problem import Problem
 
 if TYPE_CHECKING:
     from masiv.inference.model_fit import ModelFit
@@ -88,11 +90,11 @@ class Model:
 def parameters(model: Model, observations: Sequence[VideoObservation]) -> tuple[Parameter, ...]:
     """What is fitted: law and effects, shared by all experiments, and each one's throw and share of what finer grids
     change, named ``name@observation``."""
-    gone = {effect_named(name).replaces_parameter for name in model.effects}
+    gone = {effect_named(name).hints.replaces_parameter for name in model.effects}
     own = [
         replace(p, name=f"{p.name}@{e.name}")
         for e in observations
-        for p in initial_state_parameters(e.problem, e.motion)
+        for p in initial_state_parameters(e.motion, e.problem.ground_range)
         if p.name not in gone
     ]
     grids = [Parameter(f"{GRID_CHANGE}@{e.name}", 0.0, -1.0, 3.0, 0.25) for e in observations if e.grid_changes]
@@ -103,7 +105,7 @@ def parameters(model: Model, observations: Sequence[VideoObservation]) -> tuple[
 def initial_state_of(values: Mapping[str, float], observation: VideoObservation) -> InitialState:
     """The throw of ``observation`` among ``values``."""
     suffix = f"@{observation.name}"
-    return initial_state_from({n.removesuffix(suffix): v for n, v in values.items() if n.endswith(suffix)})
+    return InitialState.of_values({n.removesuffix(suffix): v for n, v in values.items() if n.endswith(suffix)})
 
 
 def active(model: Model, values: Mapping[str, float], problem: Problem) -> ActiveEffects | None:
@@ -162,15 +164,15 @@ class Simulation(SharedRollouts):
     def candidates(self, model: Model) -> list[str]:
         """Effects that ``model`` lacks; one contact with the ground at most, and none where there is no ground."""
         library = causes()
-        taken = model.contact == "none" or any(effect_named(n).on_grid == "ground" for n in model.effects)
-        apart = (*model.effects, *(n for n, e in library.items() if e.needs_clamp))  # nothing holds a thrown body
-        return [n for n, e in library.items() if n not in apart and not (taken and e.on_grid == "ground")]
+        taken = model.contact == "none" or any(isinstance(effect_named(n), ContactEffect) for n in model.effects)
+        apart = (*model.effects, *(n for n, e in library.items() if e.hints.needs_clamp))  # nothing holds a thrown body
+        return [n for n, e in library.items() if n not in apart and not (taken and isinstance(e, ContactEffect))]
 
     def term(self, name: str) -> EffectTerm:
         """The effect, of all that is filmed; its guesses are of what may be fitted of the first experiment."""
         first = self.observations[0]
         term = plain_term(name, replace(first.problem.setting(), path=_path(first)))
-        instead = effect_named(name).replaces_parameter
+        instead = effect_named(name).hints.replaces_parameter
         return replace(
             term, replaces_parameter=() if instead is None else tuple(f"{instead}@{e.name}" for e in self.observations)
         )
@@ -180,7 +182,7 @@ class Simulation(SharedRollouts):
         throws = {
             f"{p.name}@{e.name}": p.start
             for e in self.observations
-            for p in initial_state_parameters(e.problem, e.motion)
+            for p in initial_state_parameters(e.motion, e.problem.ground_range)
         }
         return {name: throws.get(name, value) for name, value in values.items()}
 
@@ -208,7 +210,7 @@ class Simulation(SharedRollouts):
         theta = torch.tensor([after.values[p.name] for p in term.parameters])
         watched = max((e.fitted - 1) / e.problem.scene.fps for e in self.observations)
         places = torch.cat([_path(e).reshape(-1, 3) for e in self.observations])
-        reason = effect_named(term.effect).identifiability_issue(theta, watched, places)
+        reason = effect_named(term.effect).hints.identifiability_issue(theta, watched, places)
         return [] if reason is None else [reason]
 
     @torch.no_grad()

@@ -11,13 +11,15 @@ import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.errors import InputError, MasivError
 from masiv.models.attachment import Attachment, attach
+from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import Geometry
 from masiv.tracks.tracks import Run, Tracks
@@ -65,24 +67,26 @@ class SimulatedBody:
         """Longest side [m] of the particles' bounding box."""
         return float((self.particles.max(0).values - self.particles.min(0).values).max())
 
-    def released(self, dtype: torch.dtype = torch.float32, lift: float = 0.0) -> State:
-        """State at the release: at rest, stress-free if ``lift`` [m] is 0 (``masiv.models.cantilever_preload``)."""
-        from masiv.models.cantilever_preload import bent
-
-        x, gradient = bent(self, lift)
+    def released(self, dtype: torch.dtype = torch.float32, deflection: float = 0.0) -> State:
+        """State at the release: at rest. It is stress-free if ``deflection`` [m] is 0, else bent as by its weight."""
+        x = self.particles.double()
+        gradient = torch.eye(3, dtype=x.dtype).expand(len(x), 3, 3)
+        axes = clamp_axes(self.gravity, self.normals)
+        if axes is not None and deflection != 0:
+            x, gradient = static_deflection(x, self.heights[0], axes, deflection)
         still = torch.zeros_like(x, dtype=dtype)
         return replace(at_rest(x.to(dtype), still, torch.zeros_like(gradient, dtype=dtype)),
                        trial_gradient=gradient.to(dtype).contiguous())  # fmt: skip
 
     def effects(self, members: tuple = (), *, duration: float, frame_time: float) -> ActiveEffects:
         """Effects with their parameters, and after them the clamp."""
-        from masiv.effects._clamp import clamped
+        from masiv.effects.boundary.clamp import with_clamp
 
         x = self.particles
         gravity = torch.as_tensor(self.gravity, dtype=x.dtype)
         setting = EffectContext(gravity, x, self.mass / len(x), self.size, duration, frame_time)
         active = ActiveEffects(tuple(members), setting)
-        return clamped(active, self.normals, self.heights) if len(self.heights) else active
+        return with_clamp(active, self.normals, self.heights) if len(self.heights) else active
 
     def markers_to_world(self, positions: torch.Tensor) -> np.ndarray:
         """Particles (T, N, 3) [m, simulation frame] -> markers (T, len(markers), 3) [m, world]."""

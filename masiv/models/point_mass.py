@@ -15,14 +15,16 @@ import numpy as np
 import torch
 
 from masiv.effects.catalogue import causes, effect_named
-from masiv.effects.effect import DragBody, Effect, EffectContext, EffectParameter
+from masiv.effects.context import EffectContext, EffectParameter
+from masiv.effects.effect import Effect, NodalEffect
+from masiv.effects.per_body import DragBody
 from masiv.errors import InputError, NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import ModelFit, rms_mm
 from masiv.kernels.points import point_kernels
 from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit, plain_term
 from masiv.models.families import Family
 from masiv.models.free_body import Model
+from masiv.models.parameters import Parameter
 from masiv.refine.config import RefineConfig
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import Geometry
@@ -169,12 +171,14 @@ class PointSimulation(SharedRollouts):
         """Effects of the surroundings once; those that depend on the body once for all, and once a body."""
         out, taken = [], [self.term(name) for name in model.effects]
         for name, effect in causes().items():
-            if effect.on_grid != "nodes" or any(p.unit == "m" for p in effect.parameters[effect.strengths :]):
+            at_place = any(p.unit == "m" for p in effect.parameters[effect.strengths :])
+            if at_place or not isinstance(effect, NodalEffect):
                 continue  # what acts at a place is not told by a point that passes it once
             has = [t for t in taken if t.effect == name]
             if not has:
                 out.append(self.made(name, ()).name)
-            if effect.per_body and len(self.bodies) > 1 and all(t.bodies for t in has):
+            differs = effect.per_body is not None and effect.per_body.differs_by_body
+            if differs and len(self.bodies) > 1 and all(t.bodies for t in has):
                 held = {b for t in has for b in t.bodies}
                 fitted = {run.body for run in self.observations if run.fitted}
                 alone = [b for b in self.bodies if b not in held and b in fitted]
@@ -192,7 +196,7 @@ class PointSimulation(SharedRollouts):
             scope = EACH if bodies == self.bodies else f"{EACH} of {scope}"
         name = f"{effect}@{scope}" if bodies else effect
         if name not in self.terms:
-            shared: tuple[EffectParameter, ...] = known.shared or known.parameters
+            shared: tuple[EffectParameter, ...] = (known.per_body or known).parameters
             cut = known.strengths
             own = [
                 (f"{name}.{p.name}{'' if body is None else f' of {body}'}", p)
@@ -229,7 +233,7 @@ class PointSimulation(SharedRollouts):
             for term in (self.term(n) for n in model.effects):
                 if term.effect == name and (not term.bodies or run.body in term.bodies):
                     given = torch.tensor([values[p.name] for p in self.own(term, run.body)], dtype=torch.float64)
-                    theta = effect.of(given, run.outline)
+                    theta = effect.per_body.of_body(given, run.outline) if effect.per_body else given
             if theta is None:
                 absent = [0.0 if k < effect.strengths else p.start for k, p in enumerate(effect.parameters)]
                 theta = torch.tensor(absent, dtype=torch.float64)
@@ -324,7 +328,8 @@ class PointSimulation(SharedRollouts):
     def _contradiction(self, fitted: ModelFit, term: EffectTerm, body: str) -> str | None:
         run = next(run for run in self.observations if run.body == body)
         theta = torch.tensor([fitted.values[p.name] for p in self.own(term, body)], dtype=torch.float64)
-        return effect_named(term.effect).violates_bounds(theta, run.outline)
+        per_body = effect_named(term.effect).per_body
+        return per_body.violates_bounds(theta, run.outline) if per_body else None
 
     def objections(self, before: ModelFit, after: ModelFit, term: EffectTerm, config: RefineConfig) -> list[str]:
         """A term of all must make no body worse, one of some must make those better, on runs that were held out."""

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from masiv.identify.config import IdentifyConfig
-from masiv.inference.noise_floor import noise_floor
 from masiv.models.free_body import VideoObservation
-from masiv.models.initial_motion import InitialMotion, estimate_initial_motion
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialMotion, InitialState, estimate_initial_motion
+from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing
 from masiv.observations.motion import Observed
+from masiv.observations.noise_floor import noise_floor
 from masiv.refine.config import RefineConfig
 from masiv.rigid import beyond_rigid
 from masiv.scene.scene import Scene

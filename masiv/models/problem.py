@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,48 +12,21 @@ import torch
 from masiv.continuum.trajectory import Trajectory
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.law import Law
 from masiv.models.geometry_loss import chamfer_error, surface_points, trajectory_error
+from masiv.models.initial_state import InitialState, rigid_initial_state
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
-from masiv.scene.scene import Ground, Scene
+from masiv.scene.scene import Scene
 from masiv.scene.transforms import SimulationFrame
-from masiv.simulation.simulate import rigid_initial_state
 from masiv.twin import TwinEffect
 
 if TYPE_CHECKING:
     from masiv.identify.paint import Paint
-
-
-@dataclass
-class InitialState:
-    """Parameters of a throw, simulation frame: velocity (3,) [m/s], omega (3,) [rad/s], ground_offset () [m], how far
-    the effective ground lies above the scene's."""
-
-    velocity: torch.Tensor
-    omega: torch.Tensor
-    ground_offset: torch.Tensor
-
-    @classmethod
-    def of_world(
-        cls, axes: SimulationFrame, velocity: np.ndarray, omega: np.ndarray, ground_offset: float = 0.0
-    ) -> InitialState:
-        """From velocity (3,) [m/s] and omega (3,) [rad/s] in the world frame."""
-        turned = (torch.as_tensor(axes.vectors_to_simulation(v), dtype=torch.float32) for v in (velocity, omega))
-        return cls(*turned, torch.tensor(ground_offset, dtype=torch.float32))
-
-    def tensors(self) -> tuple[torch.Tensor, ...]:
-        return self.velocity, self.omega, self.ground_offset
-
-    def ground(self, of_scene: Ground | None) -> Ground | None:
-        """The effective ground."""
-        if of_scene is None:
-            return None
-        return Ground(of_scene.normal, of_scene.height + float(self.ground_offset))
 
 
 class Problem:
@@ -98,6 +70,11 @@ class Problem:
         self.speed = float((span[1:] - span[:-1]).norm(dim=2).max()) * self.samples * scene.fps
         members = tuple((effect_named(e.name), torch.tensor([v for _, v, *_ in e.rows()])) for e in known)
         self.known = ActiveEffects(members, self.setting()) if members else None
+
+    @property
+    def ground_range(self) -> float:
+        """Greatest offset [m] of the effective ground, 0 if there is no ground."""
+        return 0.0 if self.scene.ground is None else self.config.ground_range
 
     def of_surfaces(self, iterations: int) -> Problem:
         """The same with ``iterations``, the loss "surface" and more weight of the pictures."""

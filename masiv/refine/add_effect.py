@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from masiv.errors import NonFiniteError
-from masiv.inference.least_squares import Parameter
 from masiv.inference.model_fit import (
     ModelFit,
     best_strength,
@@ -21,6 +20,7 @@ from masiv.inference.model_fit import (
     robust_cost,
 )
 from masiv.models.base import EffectTerm, ForwardModel
+from masiv.models.parameters import Parameter
 from masiv.refine.candidates import Candidate
 
 CHORD_STEPS = 8

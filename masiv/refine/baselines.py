@@ -19,7 +19,8 @@ from masiv.inference.model_fit import (
 )
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import Model, Simulation, parameters
-from masiv.models.problem import InitialState, Problem
+from masiv.models.initial_state import InitialState
+from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
 from masiv.refine.tasks import map_tasks

@@ -16,9 +16,10 @@ from masiv import runtime
 from masiv.effects.active import ActiveEffects
 from masiv.errors import InputError, NonFiniteError
 from masiv.files import write_npz
+from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.design import grid_spacing, substeps_per_frame
-from masiv.mpm.rollout import at_rest
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.progress import Progress, silent
 from masiv.scene.transforms import SimulationFrame
 from masiv.simulation.subdivide import finer
@@ -63,20 +64,6 @@ class Push:
         inside = [t for t in (self.start, self.stop) if begin + shortest < t < end - shortest]
         cuts = [begin, *inside, end]
         return [(b - a, self.start < 0.5 * (a + b) < self.stop) for a, b in itertools.pairwise(cuts)]
-
-
-def skew(omega: torch.Tensor) -> torch.Tensor:
-    """The matrix W (3, 3) with W r = omega x r."""
-    x, y, z = omega.unbind()
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-
-
-def rigid_initial_state(position: torch.Tensor, velocity: torch.Tensor, omega: torch.Tensor) -> State:
-    """An undeformed body (N, 3) [m] with the velocity (3,) [m/s] of its centroid and a spin (3,) [rad/s] about it."""
-    spin = skew(omega)
-    arm = position - position.mean(0)
-    return at_rest(position, velocity + arm @ spin.T, spin.expand(len(position), 3, 3))
 
 
 def simulate(

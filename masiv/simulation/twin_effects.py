@@ -9,7 +9,8 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
+from masiv.effects.effect import GridEffect
 from masiv.scene.transforms import SimulationFrame
 
 if TYPE_CHECKING:
@@ -55,12 +56,12 @@ def lowered(effects: ActiveEffects, by: torch.Tensor) -> ActiveEffects:
     members = []
     for effect, theta in effects.members:
         names = [p.name for p in effect.parameters]
-        if effect.on_grid is not None and "y" in names:
+        if isinstance(effect, GridEffect) and "y" in names:
             height = torch.zeros_like(theta)
             height[names.index("y")] = 1.0
             theta = theta - height * by
         members.append((effect, theta))
-    return ActiveEffects(tuple(members), effects.setting)
+    return ActiveEffects(tuple(members), effects.context)
 
 
 def mass_ratio(effects: ActiveEffects | None) -> float:
