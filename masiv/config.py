@@ -12,8 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import InputError
-from masiv.identify.config import IdentifyConfig
+from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
 from masiv.mpm.config import SimulatorConfig
+from masiv.refine.config import RENAMED_KEYS as REFINE_RENAMED_KEYS
 from masiv.refine.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
 from masiv.strict import read_yaml, validated
@@ -28,9 +29,16 @@ RENAMED_KEYS = {
     "trajectory.carve_misses": "carve_images",
     "trajectory.batch": "batch_size",
     "trajectory.match_every": "match_interval",
+    "identify.polish": "surface_finetune",
+    "identify.polish_silhouette_weight": "finetune_silhouette_weight",
+    "identify.paint_weight": "color_weight",
+    "identify.polish_paint_weight": "finetune_color_weight",
     "tracks.highest_poissons_ratio": "max_poissons_ratio",
+    **{f"refine.{old}": new for old, new in REFINE_RENAMED_KEYS.items()},
 }
 """Keys of earlier versions: section and old name -> new name in the same section."""
+RENAMED_VALUES = {"identify.start": RENAMED_STARTS}
+"""Values of earlier versions by section and key: old value -> new value."""
 
 Preset = Literal["quick", "standard", "paper"]
 DEFAULT_PRESET = "standard"
@@ -86,13 +94,18 @@ def load_config(
 
 
 def renamed_keys(config: Mapping[str, Any]) -> dict[str, Any]:
-    """``config``, of a run or a file of this or an earlier version, with the present names of its keys."""
+    """``config``, of a run or a file of this or an earlier version, with the present names of its keys and values."""
     result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
     for old, new in RENAMED_KEYS.items():
         section, key = old.split(".")
         values = result.get(section)
         if isinstance(values, dict) and key in values:
             values.setdefault(new, values.pop(key))
+    for name, renamed in RENAMED_VALUES.items():
+        section, key = name.split(".")
+        values = result.get(section)
+        if isinstance(values, dict) and values.get(key) in renamed:
+            values[key] = renamed[values[key]]
     return result
 
 

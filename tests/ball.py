@@ -1,15 +1,16 @@
-"""A ball that stands in the air, filled evenly with particles, as a problem of identify."""
+"""A ball that stands in the air, filled evenly with particles, as the image terms of a fit compare it."""
 
 from __future__ import annotations
 
 import numpy as np
 from ring_scene import ring, spheres_scene
+from small import SMALL
 from test_identify import Seen
 
 from masiv.continuum.fill import DensityField, even_points
 from masiv.identify.config import IdentifyConfig
+from masiv.identify.losses.images import ImageTerms
 from masiv.models.problem import Problem
-from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Scene
 
 CENTRE, RADIUS, FRAMES = np.array([0.0, 0.45, 0.0]), 0.25, 2
@@ -20,7 +21,8 @@ def ball_scene() -> Scene:
     return spheres_scene(lambda frame: [(CENTRE, RADIUS)], frame_count=FRAMES, cameras=cameras)
 
 
-def ball_problem(scene: Scene, spacing: float) -> Problem:
+def ball_terms(scene: Scene, spacing: float) -> ImageTerms:
+    """Particles of ``spacing`` [m]."""
     step = 0.01
     axis = np.arange(-0.3, 0.3 + step, step)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
@@ -28,4 +30,4 @@ def ball_problem(scene: Scene, spacing: float) -> Problem:
     points = even_points(DensityField(inside, CENTRE - 0.3, step), spacing)
     still = np.repeat(points[None], FRAMES, axis=0).astype(np.float32)
     seen = Seen(still, np.arange(FRAMES) / scene.fps, len(points) * spacing**3)
-    return Problem(scene, seen, IdentifyConfig(), SimulatorConfig())
+    return ImageTerms(Problem(scene, seen, IdentifyConfig(), SMALL), with_colors=True)

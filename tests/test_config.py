@@ -57,11 +57,21 @@ def test_a_run_is_the_base_unless_a_preset_is_asked_for(tmp_path):
 def test_keys_of_earlier_versions_are_read(tmp_path, old):
     section, key = old.split(".")
     new = RENAMED_KEYS[old]
-    value = 0.25 if isinstance(getattr(getattr(Config(), section), new), float) else 151
+    default = getattr(getattr(Config(), section), new)
+    value = not default if isinstance(default, bool) else 0.25 if isinstance(default, float) else 151
     from_file = load_config(None, write(tmp_path, f"{section}: {{{key}: {value}}}"))
     assert getattr(getattr(from_file, section), new) == value
     assert load_config(base={section: {key: value}}) == from_file
     assert renamed_keys({section: {key: 1, new: 2}}) == {section: {new: 2}}
+
+
+def test_values_of_earlier_versions_are_read():
+    old = {"identify": {"start": "honey", "contact": "slip"}}
+    assert renamed_keys(old) == {"identify": {"start": "maxwell_fluid", "contact": "slip"}}
+    assert old["identify"]["start"] == "honey"
+    assert load_config(base=old).identify.start == "maxwell_fluid"
+    current = Config().model_dump(mode="json")
+    assert renamed_keys(current) == current
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def describe(law: Law, excited: Excited, *, substep: float = 5e-4) -> Material:
     Moduli are those of the stress at F = I. Yield is where 0.2 % of an axial strain with free sides is permanent: the
     0.2 % offset without its assumption that unloading follows the slope at rest, which no large strain does.
     """
-    law = curves.exact(law)
+    law = curves.in_float64(law)
     strain = float(np.clip(excited.strain[1], SMALLEST, LARGEST))
     log_volume = min(excited.log_volume[0], -2e-3), max(excited.log_volume[1], 2e-3)
     rate = max(excited.rate, strain / (POINTS * 2 * substep))  # slower loading would flow in too long steps
@@ -108,20 +108,23 @@ def describe_twin(
     data there are. Rollouts are of at most ``particles`` of the twin's.
     """
     from masiv import runtime
-    from masiv.simulation.simulate import march, simulate
+    from masiv.simulation.free_body import iterate_states
+    from masiv.simulation.simulate import simulate
 
     chosen = kd_tree_subset(twin.positions.astype(np.float64), particles)
-    few = replace(twin, positions=twin.positions[chosen], simulator=twin.simulator.model_copy(update={"split": 1}))
+    coarse = replace(
+        twin.with_body(particles=twin.positions[chosen]), simulator=twin.simulator.model_copy(update={"split": 1})
+    )
     done = 0
 
     def reroll(law: Law) -> np.ndarray:
         nonlocal done
         done += 1
         progress("describe", done, 6)
-        return simulate(replace(few, law=law), frames=frames, fps=twin.fps).positions
+        return simulate(coarse.with_body(law=law), frames=frames, fps=twin.fps).positions
 
     with runtime.torch_threads(1):
-        excited = excited_range(march(few, frames=frames, fps=twin.fps))
+        excited = excited_range(iterate_states(coarse, frames=frames, fps=twin.fps))
         progress("describe", 0, 6)
         material = describe(twin.law, excited)
         residual = None
@@ -269,7 +272,7 @@ def _drawn(
 
     family = None
     if nearest.parameters:
-        family = curves.exact(ClassicalLaw(nearest.kind, **{n: v["value"] for n, v in nearest.parameters.items()}))
+        family = curves.in_float64(ClassicalLaw(nearest.kind, **{n: v["value"] for n, v in nearest.parameters.items()}))
     reach = WIDER * strain
     steps = np.arange(1, POINTS + 1) / POINTS
     shear = curves.there_and_back(math.sqrt(3) * reach, POINTS)

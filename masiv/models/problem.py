@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import functools
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 
@@ -15,7 +11,6 @@ from masiv.effects.catalogue import effect_named
 from masiv.effects.context import EffectContext
 from masiv.identify.config import IdentifyConfig
 from masiv.materials.law import Law
-from masiv.models.geometry_loss import chamfer_error, surface_points, trajectory_error
 from masiv.models.initial_state import InitialState, rigid_initial_state
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
@@ -24,9 +19,6 @@ from masiv.mpm.simulator import Simulator
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import SimulationFrame
 from masiv.twin import TwinEffect
-
-if TYPE_CHECKING:
-    from masiv.identify.paint import Paint
 
 
 class Problem:
@@ -56,11 +48,9 @@ class Problem:
         instants = np.arange(1, self.frames * self.samples + 1) / (self.samples * scene.fps)
         points = trajectory.evaluate(np.concatenate([[0.0], instants]))
         self.chosen = np.arange(points.shape[1]) if chosen is None else chosen
-        on_surface = surface_points(points[0]) if config.geometry_loss == "surface" else None
         points = points[:, self.chosen]
         moved = torch.as_tensor(self.axes.points_to_simulation(points), dtype=torch.float32)
         self.start, self.targets = moved[0].contiguous(), moved[1:]
-        self.surface = None if on_surface is None else torch.from_numpy(np.flatnonzero(on_surface[self.chosen]))
         self.count = len(self.start)
         self.volume = trajectory.volume
         self.spacing = grid_spacing(self.volume, self.count, simulator)
@@ -75,33 +65,6 @@ class Problem:
     def ground_range(self) -> float:
         """Greatest offset [m] of the effective ground, 0 if there is no ground."""
         return 0.0 if self.scene.ground is None else self.config.ground_range
-
-    def of_surfaces(self, iterations: int) -> Problem:
-        """The same with ``iterations``, the loss "surface" and more weight of the pictures."""
-        c = self.config
-        weights = {"silhouette_weight": c.polish_silhouette_weight, "paint_weight": c.polish_paint_weight}
-        other = copy.copy(self)
-        other.config = c.model_copy(update={"geometry_loss": "surface", "iterations": iterations, **weights})
-        other.surface = torch.from_numpy(np.flatnonzero(surface_points(self.start.numpy())))
-        return other
-
-    @functools.cached_property
-    def blob_size(self) -> float:
-        """See ``masiv.identify.pictures.blob_size``; [m]."""
-        from masiv.identify.pictures import blob_size
-
-        return blob_size(self)
-
-    @functools.cached_property
-    def paint(self) -> Paint | None:
-        """The particles' paint, None where no weight is given to it."""
-        from masiv.identify.paint import paint
-
-        return (
-            paint(self)
-            if self.scene.views and max(self.config.paint_weight, self.config.polish_paint_weight) > 0
-            else None
-        )
 
     def substeps(self, law: Law) -> int:
         """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number."""
@@ -174,18 +137,3 @@ class Problem:
         positions = rollout(simulator, law, state, int(wanted[-1]), wanted.tolist(), effects)
         early, after = (positions[torch.searchsorted(wanted, k)] for k in (before, before + 1))
         return early + (late - whole) * (after - early) + shift
-
-    def error(self, positions: torch.Tensor) -> torch.Tensor:
-        """Mean distance [m] to the observed trajectories, positions (K, N, 3) from the start."""
-        return trajectory_error(positions, self.targets[: len(positions)])
-
-    def geometry_error(self, positions: torch.Tensor) -> torch.Tensor:
-        """What ``config.geometry_loss`` compares, [m]; zero where that is none. positions as of ``error``."""
-        if self.config.geometry_loss == "trajectory":
-            return self.error(positions)
-        if self.config.geometry_loss == "none":
-            return torch.zeros(())
-        here, there = (p[self.samples - 1 :: self.samples] for p in (positions, self.targets[: len(positions)]))
-        if self.surface is not None:
-            here, there = here[:, self.surface], there[:, self.surface]
-        return chamfer_error(here, there)

@@ -20,5 +20,5 @@ class SimulatorConfig(BaseModel):
     courant_number: float = Field(0.3, gt=0, le=0.8, description="cells that sound and matter may cross in a substep")
     max_substeps_per_frame: int = Field(400, ge=1, description="a stiffer law than this allows is an error")
     grid_nodes: int = Field(1 << 18, ge=1 << 10, description="nodes reserved for the window around the object")
-    memory_mb: int = Field(1500, ge=50, description="bound on the states kept for the adjoint")
+    memory_mb: int = Field(1500, ge=1, description="bound on the states kept for the adjoint")
     chunks: int = Field(2, ge=1, le=64, description="particle chunks that scatter apart on a CPU; part of the numbers")
