@@ -112,13 +112,14 @@ def balls(source: Path) -> dict:
     from masiv.inference.model_fit import gauss_newton_fit
     from masiv.models.free_body import Model
     from masiv.refine.config import RefineConfig
-    from masiv.refine.pooling import refine_group, unlike
+    from masiv.refine.from_tracks import refine_group
+    from masiv.refine.search_state import SearchSettings
 
     tracks = ball_scene(source)
     began = time.perf_counter()
-    found = refine_group(tracks, "balls", RefineConfig.model_validate({}))
+    refined = refine_group(tracks, "balls", SearchSettings.of(RefineConfig.model_validate({})))
     seconds = time.perf_counter() - began
-    simulation, result = found.simulation, found.result
+    simulation, result = refined.forward_model, refined.search
     first = {t.candidate.effect: t for t in result.rounds[0].trials}
     alike = simulation.by_body
     rows = {
@@ -139,13 +140,14 @@ def balls(source: Path) -> dict:
         for t in terms
     }  # fmt: skip
     return {
-        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows, "refused": found.refused,
+        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows,
+        "refused": {n: b.objections for n, b in refined.bodies.items() if b.objections},
         "shared": [
-            {"bodies": s.bodies,
-             "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.effect)},
-             "spread": unlike(s, result, simulation), "information_gain": s.gain,
+            {"bodies": s.term.bodies,
+             "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.term.effect)},
+             "spread": s.strength_std, "information_gain": s.bic_gain,
              "held_out_mm": alike(s.fitted.model, s.fitted.values, fitted=False)}
-            for s in found.shared
+            for s in refined.shared
         ],
         "gravity_each": [9.8 * (1 + trap.values[p.name]) for p in each.parameters],
         "information_gain_of_gravity_each": result.before.bic(trap.samples) - trap.bic(trap.samples),

@@ -14,7 +14,7 @@ from masiv.identify.classical.fit import FamilyFit
 from masiv.identify.classical.model_selection import rank_by_bic
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.stage import identify
-from masiv.inference.correlation import effective_samples
+from masiv.inference.noise_model import effective_samples
 from masiv.materials.classical import ClassicalLaw
 from masiv.models import families
 from masiv.models.families import FAMILIES, law_of

@@ -309,9 +309,9 @@ class PointSimulation(SharedRollouts):
         out = [f"{b}: {why}" for b in term.bodies or self.bodies if (why := self._contradiction(after, term, b))]
         for body in old:
             share = 1 - new[body] / old[body]
-            if term.bodies == (body,) and share < config.least_gain:
+            if term.bodies == (body,) and share < config.min_gain:
                 out.append(f"{body}: {old[body]:.0f} mm held out become {new[body]:.0f} mm")
-            elif share < -config.least_gain:
+            elif share < -config.min_gain:
                 out.append(f"{body} does not share it: {old[body]:.0f} mm held out become {new[body]:.0f} mm")
         return out
 

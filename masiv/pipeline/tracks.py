@@ -63,7 +63,7 @@ class TracksRun(Run):
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
-        from masiv.refine.tracks_stage import identify_tracks
+        from masiv.identify.from_tracks import identify_tracks
         from masiv.report.numbers import given_or_error
 
         families: list[dict[str, Any]] = []
@@ -92,9 +92,9 @@ class TracksRun(Run):
         refuse(request, ("second_run", "relearn"), "pictures", self.folder.scene_path)
         self.folder.require("identify")
         self.start()
-        from masiv.refine.summary import ADDED, text
-        from masiv.refine.tracks_document import document, named, save_fields
-        from masiv.refine.tracks_stage import refine_tracks, refined_twin
+        from masiv.refine.document import document, save_arrays, text
+        from masiv.refine.from_tracks import refine_tracks
+        from masiv.refine.to_twin import refined_twin
         from masiv.twin.identified import load_to_refine, save_refined
 
         first = self._conditions[0]
@@ -105,14 +105,14 @@ class TracksRun(Run):
             self.tracks, twin, self.config, condition=request.condition, dry_run=request.dry_run,
             folder=self._rollout_cache, progress=progress,
         )  # fmt: skip
-        written = document(result, self.config.refine, dry_run=request.dry_run)
+        written = document(result)
         stem = refine_stem(request.condition, first)
         if request.dry_run:
             write_json(self.path / f"{stem}.dry_run.json", written)
         else:
             write_json(self.path / f"{stem}.json", written)
-            save_fields(self.path / f"{stem}.npz", result)
-            if written["verdict"] == ADDED:
+            save_arrays(self.path / f"{stem}.npz", result)
+            if result.changes_twin:
                 twin = refined_twin(twin, result)
                 save_refined(self.path, twin, self._described_twin)
             else:
@@ -120,17 +120,7 @@ class TracksRun(Run):
             self._report(twin, progress)
         if self._rollout_cache.is_dir():
             shutil.rmtree(self._rollout_cache)
-        lines = [text(named(written))]
-        for body, row in written["bodies"].items():
-            held = row["held_out_mm"]
-            what = ", ".join(row["effects"]) or row["verdict"]
-            lines.append(f"  {body:24s} {what:28s} held out {held['before']:.0f} -> {held['after']:.0f} mm")
-        for row in written["shared"]:
-            lines.append(
-                f"one {row['parameter'].replace('_', ' ')} for {', '.join(row['bodies'])}: {row['value']:.3g} ± "
-                f"{row['stderr']:.2g} {row['unit']}, {row['spread_between_bodies']:.2g} between them"
-            )
-        return Summary({"refine": str(self.path / f"{stem}.json"), **written}, "\n".join(lines))
+        return Summary({"refine": str(self.path / f"{stem}.json"), **written}, text(written))
 
     def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
         refuse(request, NOT_FOR_TRACKS, "pictures", self.folder.scene_path)
@@ -185,15 +175,15 @@ class TracksRun(Run):
         return Twin.load(self.path, scene=self._described_twin)
 
     def _described_twin(self) -> Twin:
-        from masiv.refine.tracks_stage import described_twin
+        from masiv.identify.from_tracks import described_twin
 
         return described_twin(self.tracks, self.config)
 
     def _report(self, twin: Twin, progress: Progress) -> list[dict[str, Any]]:
         """Simulate every run with the twin, and with the one before refine if there is one; metrics.json, rollout.npz,
         report.html. Returns the errors of each run."""
-        from masiv.refine.tracks_document import named, observed_of
-        from masiv.refine.tracks_stage import run_errors, simulated
+        from masiv.identify.twin_over_runs import run_errors, simulated
+        from masiv.refine.document import with_scopes
         from masiv.report.tracks_page import write_page
         from masiv.twin.identified import IDENTIFIED_FILE, load_identified
 
@@ -211,7 +201,7 @@ class TracksRun(Run):
                 made = simulated(self.tracks, model, self.config, condition)
                 observations, fields = made.simulation.observations, made.fields()
                 for observation, field in zip(observations, fields, strict=True):
-                    observed = observed_of(observation)
+                    observed = observation.values_in_world
                     own = curves.setdefault(observation.name, {"times": observation.times, "observed": observed})
                     own[name] = observed + field
                 for row in run_errors(observations, fields):
@@ -225,16 +215,19 @@ class TracksRun(Run):
             self.folder.metrics, {"runs": errors, "unit": "mm", "what": "root mean square distance of the points"}
         )
         files = [self.path / f"{refine_stem(c, self._conditions[0])}.json" for c in self._conditions]
-        refined = [named(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
+        refined = [with_scopes(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
         write_page(self.folder.report, self.tracks, twin, errors, curves, refined)
         return errors
 
 
 def refine_stem(condition: str | None, first: str) -> str:
     """Name of the files of ``refine`` without their extension: refine for the ``first`` condition (None: that one),
-    refine.CONDITION for another. A condition is any text: what no file name may hold is percent-encoded, so that no two
-    conditions share a file."""
-    return "refine" if condition is None or condition == first else f"refine.{quote(condition, safe=' ')}"
+    refine.CONDITION for another. A condition is any text: what a file name cannot hold is percent-encoded, and so are
+    dots, so that no two conditions share a file and none has that of a dry run (refine.CONDITION.dry_run)."""
+    if condition is None or condition == first:
+        return "refine"
+    encoded = quote(condition, safe=" ").replace(".", "%2E")
+    return f"refine.{'dry%5Frun' if encoded == 'dry_run' else encoded}"
 
 
 def law_entry(twin: Twin) -> dict[str, Any]:
