@@ -90,8 +90,8 @@ def test_nothing_found(tmp_path):
     assert [text for text in ("What was added", "held out", "Refits", "finer grids") if text in section] == []
 
 
-def test_a_stop_gap_is_called_one(tmp_path):
-    gap = {
+def test_a_discrepancy_force_is_no_explanation(tmp_path):
+    force = {
         "effect": "smooth_force",
         "theta": {},
         "stderr": {},
@@ -99,10 +99,10 @@ def test_a_stop_gap_is_called_one(tmp_path):
         "fit_rmse_mm": 3.25,
         "held_out_rmse_mm": 9.75,
     }
-    write(tmp_path, document(accepted=[], verdict="unexplained residual", stop_gap=gap), fields())
+    write(tmp_path, document(accepted=[], verdict="unexplained residual", discrepancy_force=force), fields())
     section = refine_section(tmp_path)
     assert [
-        t for t in ("unexplained residual", "not an explanation", "3.25", "9.75 mm held out") if t not in section
+        t for t in ("unexplained residual", "without a known cause", "3.25", "9.75 mm held out") if t not in section
     ] == []
 
 
@@ -112,7 +112,7 @@ def test_absent_and_unreadable(tmp_path):
     (tmp_path / "refine.npz").write_bytes(b"PK broken")
     with pytest.raises(InputError, match="run masiv refine again"):
         refine_section(tmp_path)
-    write(tmp_path, document(schema=2), fields())
+    write(tmp_path, document(schema=1), fields())
     with pytest.raises(InputError, match="another version"):
         refine_section(tmp_path)
 
