@@ -44,7 +44,7 @@ lint: $(INSTALLED)
 wheel-test: $(INSTALLED)
 	$(BIN)/python tests/wheel/check.py $(if $(TORCH_INDEX),--torch-index $(TORCH_INDEX))
 
-# Those that need no scene, run or measurement and end within the hour.
+# Those that need no scene, run or measurement; refine_tracks, which needs none either, is one case after the other.
 BENCHMARKS = dam_break dissipation hidden_in_law mpm_speed transfer
 
 bench: $(INSTALLED)

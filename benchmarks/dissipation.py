@@ -21,7 +21,8 @@ from scipy.optimize import brentq, least_squares
 
 from masiv import runtime
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.marker_body import plan, simulated_body, simulated_markers
+from masiv.models.marked_body import marked_body
+from masiv.models.marker_body import plan, simulated_markers
 from masiv.mpm.config import SimulatorConfig
 from masiv.tracks.declaration import GeometryDeclaration
 from masiv.tracks.geometry import make_geometry
@@ -104,7 +105,7 @@ def main() -> None:
             config = SimulatorConfig(particles_per_cell=asked.ppc, courant_number=courant, max_substeps_per_frame=2000)
             began = time.perf_counter()
             spacing = THICKNESS / cells / round(asked.ppc ** (1 / 3))
-            body = simulated_body(scene, scene.runs[0], config, particle_spacing=spacing)
+            body = marked_body(scene, scene.runs[0], config, particle_spacing=spacing)
             planned = plan(body, law, times, config, speed=0.5)
             tip = simulated_markers(body, law, times, config, speed=0.5)[:, 0, 0]
             hz, rate, amplitude = swing(times, tip, theory)

@@ -110,15 +110,16 @@ def ball_scene(source: Path):
 def balls(source: Path) -> dict:
     """What refine finds in the ball drops, and what one free gravity a ball would have looked like."""
     from masiv.inference.model_fit import gauss_newton_fit
-    from masiv.models.free_body import Model
+    from masiv.models.base import Model
     from masiv.refine.config import RefineConfig
-    from masiv.refine.pooling import refine_group, unlike
+    from masiv.refine.from_tracks import refine_group
+    from masiv.refine.search_state import SearchSettings
 
     tracks = ball_scene(source)
     began = time.perf_counter()
-    found = refine_group(tracks, "balls", RefineConfig.model_validate({}))
+    refined = refine_group(tracks, "balls", SearchSettings.of(RefineConfig()))
     seconds = time.perf_counter() - began
-    simulation, result = found.simulation, found.result
+    simulation, result = refined.forward_model, refined.search
     first = {t.candidate.effect: t for t in result.rounds[0].trials}
     alike = simulation.by_body
     rows = {
@@ -139,13 +140,13 @@ def balls(source: Path) -> dict:
         for t in terms
     }  # fmt: skip
     return {
-        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows, "refused": found.refused,
+        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows, "refused": {n: b.objections for n, b in refined.bodies.items() if b.objections},
         "shared": [
-            {"bodies": s.bodies,
-             "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.effect)},
-             "spread": unlike(s, result, simulation), "information_gain": s.gain,
+            {"bodies": s.term.bodies,
+             "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.term.effect)},
+             "spread": s.strength_std, "information_gain": s.bic_gain,
              "held_out_mm": alike(s.fitted.model, s.fitted.values, fitted=False)}
-            for s in found.shared
+            for s in refined.shared
         ],
         "gravity_each": [9.8 * (1 + trap.values[p.name]) for p in each.parameters],
         "information_gain_of_gravity_each": result.before.bic(trap.samples) - trap.bic(trap.samples),
@@ -171,7 +172,8 @@ def damping(
 
     from masiv.effects.catalogue import effect_named
     from masiv.materials.classical import ClassicalLaw
-    from masiv.models.marker_body import simulated_body, simulated_markers
+    from masiv.models.marked_body import marked_body
+    from masiv.models.marker_body import simulated_markers
     from masiv.mpm.config import SimulatorConfig
     from masiv.tracks.read import read_tracks
 
@@ -186,7 +188,7 @@ def damping(
         hz, rate, amplitude = swing(seen.elapsed, seen.positions[:, 0, 0], 7.5)
         rows.append({"measured": name, "hz": hz, "decay_per_s": rate, "amplitude_mm": 1e3 * amplitude})
     for count in particles:
-        body = simulated_body(tracks, tracks.runs[0], config, particle_spacing=(9e-5 / count) ** (1 / 3))
+        body = marked_body(tracks, tracks.runs[0], config, particle_spacing=(9e-5 / count) ** (1 / 3))
         for eta in (0.0, viscosity):  # a fine grid and much viscosity need a smaller Courant number
             began = time.perf_counter()
             members = ((effect_named("viscosity"), torch.tensor([eta])),)
@@ -203,9 +205,10 @@ def damping(
 def load(source: Path, youngs: float, viscosity: float, particles: int, courant: float, what: list[str]) -> list[dict]:
     """The loaded beam with one effect at the middle of its end, law and viscosity known: what is left of load52_a, from
     0.1 to 0.6 s after its release, and of load52_b, which is held out."""
-    from masiv.identify.tracks import family_of, simulation_of
+    from masiv.identify.tracks import simulation_of
     from masiv.inference.model_fit import gauss_newton_fit
-    from masiv.models.free_body import Model
+    from masiv.models.base import Model
+    from masiv.models.families import family_of
     from masiv.mpm.config import SimulatorConfig
     from masiv.tracks.config import TracksConfig
     from masiv.tracks.read import read_tracks

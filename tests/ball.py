@@ -8,7 +8,7 @@ from test_identify import Seen
 
 from masiv.continuum.fill import DensityField, even_points
 from masiv.identify.config import IdentifyConfig
-from masiv.models.problem import Problem
+from masiv.identify.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Scene
 

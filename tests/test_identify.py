@@ -10,17 +10,17 @@ from scipy.spatial.transform import Rotation
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
+from masiv.identify.problem import Problem
 from masiv.identify.stage import identify
 from masiv.identify.start import DIVERGED, STIFFEST, Start, _error, best_first
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.models.initial_state import InitialState, estimate_initial_motion
-from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.simulate import simulate
-from masiv.simulation.subdivide import wholes
+from masiv.simulation.subdivide import merge_subparticles
 from masiv.twin import Twin
 
 GRAVITY = np.array([0.0, -9.8, 0.0])
@@ -64,7 +64,7 @@ def body():
 @pytest.fixture(scope="module")
 def seen(taichi, body):
     law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
-    truth = Twin(
+    truth = Twin.of_body(
         positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
         volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(split=1),
     )  # fmt: skip
@@ -119,7 +119,7 @@ def test_a_law_that_flows_must_be_plainly_nearer():
 def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
     trajectory, positions = seen
     twin = identify(scene(), trajectory, settings(), SimulatorConfig())
-    predicted = wholes(simulate(twin, frames=FRAMES + 4).positions, positions.shape[1])
+    predicted = merge_subparticles(simulate(twin, frames=FRAMES + 4).positions, positions.shape[1])
     error = np.linalg.norm(predicted - positions, axis=2).mean(1)
     rigid = np.linalg.norm(positions[-1] - positions[0] - (positions[-1] - positions[0]).mean(0), axis=1).mean()
     assert twin.fit["trajectory_error_mm"] < 8

@@ -12,7 +12,7 @@ from masiv.identify import baseline
 from masiv.identify.classical_fit import FamilyFit, ranked
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.stage import identify
-from masiv.inference.correlation import effective_samples
+from masiv.inference.noise_model import effective_samples
 from masiv.materials.classical import ClassicalLaw
 from masiv.models import families
 from masiv.models.families import FAMILIES, law_of
@@ -29,7 +29,7 @@ def body():
 
 
 def filmed(body, law):
-    truth = Twin(
+    truth = Twin.of_body(
         positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
         volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(split=1),
     )  # fmt: skip

@@ -7,11 +7,11 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.identify import learn
 from masiv.identify.fit import Fit
+from masiv.identify.problem import Problem
 from masiv.identify.start import Start
 from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import silent
 

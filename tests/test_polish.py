@@ -14,11 +14,11 @@ from masiv.identify import polish
 from masiv.identify.fit import Fit, fit_from, fit_state
 from masiv.identify.objective import objective
 from masiv.identify.pictures import some_of_each
+from masiv.identify.problem import Problem
 from masiv.identify.stage import identify
 from masiv.identify.throw import Throw
 from masiv.materials.load import load_law
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Frame

@@ -14,9 +14,9 @@ from test_workers import small_simulation
 from masiv.errors import MasivError
 from masiv.inference.discretization import with_grid_errors, with_residual_std
 from masiv.inference.model_fit import ModelFit, best_strength, column, gauss_newton_jump, strengths_alone
-from masiv.models.base import EffectTerm, WeightedResidual
+from masiv.models.base import EffectTerm, Model, WeightedResidual
 from masiv.models.families import FAMILIES
-from masiv.models.free_body import Model, Simulation
+from masiv.models.free_body import FreeBodyModel
 from masiv.models.parameters import Parameter
 from masiv.refine import second_effect
 from masiv.refine.add_effect import absent
@@ -43,7 +43,7 @@ class Observation(WeightedResidual):
     time_count: int = INSTANTS
     fit_count: int = ROWS
     holds_out: bool = True
-    grid_changes: tuple[np.ndarray, ...] = ()
+    grid_corrections: tuple[np.ndarray, ...] = ()
 
 
 class Linear:
@@ -128,7 +128,7 @@ def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
     common, apart = 3e-2 * random.normal(size=shape), 1e-2 * random.normal(size=shape)
     alike = found(common, 1.2 * common + absorbed)
     np.testing.assert_allclose(alike.residual_std, NOISE, rtol=1e-6)
-    np.testing.assert_array_equal(alike.grid_changes, [common, 1.2 * common + absorbed])
+    np.testing.assert_array_equal(alike.grid_corrections, [common, 1.2 * common + absorbed])
     differing = found(common + apart, common - apart)
     rms = np.sqrt((apart**2).sum(2).mean(1))
     # A third grid is off the mean of two by the square root of three times as much as they are.
@@ -142,7 +142,7 @@ def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
     np.testing.assert_array_equal(
         found(common + apart, common - apart, fitted=again).residual_std, differing.residual_std
     )
-    assert found().grid_changes == ()
+    assert found().grid_corrections == ()
     np.testing.assert_array_equal(found().residual_std, NOISE)
 
 
@@ -161,7 +161,7 @@ def test_standard_errors_hold_what_one_more_grid_would_move():
     fitted = ModelFit(None, values, tuple(params), np.zeros(len(jacobian)), columns, 1.0, 9, 1.0, 1.0, [], errors)
     assert with_grid_errors(simulation, fitted, 1.0) is fitted  # no grid is known to change anything
     changes = (common + apart, common - apart)
-    simulation.observations = (replace(simulation.observations[0], grid_changes=changes),)
+    simulation.observations = (replace(simulation.observations[0], grid_corrections=changes),)
     found = with_grid_errors(simulation, fitted, 1.0).stderr
     # The mean's own size is what its share is for; a third grid is off it by the square root of three times as much.
     assert found[share.name] == pytest.approx(errors[share.name])
@@ -308,7 +308,7 @@ def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
         def fit_count(self):
             return (self.fitted - 1) * self.problem.samples
 
-    simulation = Simulation([Throw(SimpleNamespace(size=0.5, samples=2))])
+    simulation = FreeBodyModel([Throw(SimpleNamespace(size=0.5, samples=2))])
     near = np.full(30, 1e-6)
     assert simulation.curriculum(SimpleNamespace(squares=[near])) == []
     away = np.where(np.arange(30) < 12, near, 0.2**2)  # at the end of frame 6, all is well
@@ -316,7 +316,7 @@ def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
     # A fit that gives up the flight for what comes after it shows at once, which is no sign of when that was.
     everywhere = np.full(30, 0.2**2)
     for flight, horizons in ((3, [6, 9]), (6, [9, 10])):
-        simulation = Simulation([replace(simulation.observations[0], flight=flight)])
+        simulation = FreeBodyModel([replace(simulation.observations[0], flight=flight)])
         assert [
             s.observations[0].fitted for s in simulation.curriculum(SimpleNamespace(squares=[everywhere]))
         ] == horizons
@@ -341,7 +341,7 @@ def test_a_law_that_few_particles_can_take_finer_grids_can_take_too():
 
     def possible(modulus):
         try:
-            return observation.problem.least_substeps(law(modulus)) > 0
+            return observation.problem.min_substeps(law(modulus)) > 0
         except MasivError:
             return False
 
@@ -357,7 +357,7 @@ def test_a_model_has_a_share_of_what_finer_grids_change():
     values = {p.name: p.start for p in simulation.parameters(model)}
     (without,) = simulation.fields(model, values)
     change = np.random.default_rng(0).normal(size=(simulation.observations[0].time_count, *without.shape[1:]))
-    simulation.observations = (replace(simulation.observations[0], grid_changes=(0.9 * change, 1.1 * change)),)
+    simulation.observations = (replace(simulation.observations[0], grid_corrections=(0.9 * change, 1.1 * change)),)
     share = simulation.parameters(model)[0]
     assert (share.name, share.start) == ("grid_change@run", 0.0)
     rolled = simulation.rollouts

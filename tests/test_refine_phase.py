@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from masiv.inference.model_fit import gauss_newton_fit, robust_cost
-from masiv.models.base import EffectTerm, WeightedResidual
-from masiv.models.free_body import Model
+from masiv.models.base import EffectTerm, Model, WeightedResidual
 from masiv.models.parameters import Parameter
 from masiv.refine.add_effect import refit
 from masiv.refine.candidates import score

@@ -42,7 +42,7 @@ DROP = np.array([-0.3, -2.5, 0.1])
 @pytest.fixture(scope="module")
 def dropped(taichi, body):  # noqa: F811
     """Another throw of the body of ``seen``."""
-    truth = Twin(
+    truth = Twin.of_body(
         positions=body, velocity=DROP, omega=-OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
         volume=0.064, density=1000.0, up=UP, fps=FPS,
         law=ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3), simulator=SimulatorConfig(split=1),

@@ -16,7 +16,8 @@ from masiv.effects.catalogue import effects
 from masiv.errors import MasivError
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.attachment import attach
-from masiv.models.marker_body import fill_geometry, plan, simulated_body, simulated_markers
+from masiv.models.marked_body import marked_body
+from masiv.models.marker_body import fill_geometry, plan, simulated_markers
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.tracks.declaration import GeometryDeclaration
@@ -102,7 +103,7 @@ def _second_moments(solid):
 
 def test_mass_and_place_in_the_simulator():
     scene = bar()
-    body = simulated_body(scene, scene.runs[0], CONFIG, particle_spacing=5e-3)
+    body = marked_body(scene, scene.runs[0], CONFIG, particle_spacing=5e-3)
     made = plan(body, ClassicalLaw("neo_hookean", youngs_modulus=1e5, poissons_ratio=0.3), np.array([0, 0.01]), CONFIG)
     assert made.simulator.mass.double().sum().item() == pytest.approx(1070 * 9e-5, rel=1e-6)
     assert body.gravity == pytest.approx(np.array([0, -9.8, 0]))  # up is an axis of the grid
@@ -120,7 +121,7 @@ def test_mass_and_place_in_the_simulator():
 def test_clamp_holds_against_effects_and_has_no_part_in_gradients(taichi):
     """Within the clamp nothing moves at all, whatever acts there; the gradient of a drag beside it is right."""
     scene = bar()
-    body = simulated_body(scene, scene.runs[0], CONFIG, particle_spacing=7.5e-3)
+    body = marked_body(scene, scene.runs[0], CONFIG, particle_spacing=7.5e-3)
     body = replace(body, heights=body.heights + 0.045)
     law = ClassicalLaw("neo_hookean", youngs_modulus=5e4, poissons_ratio=0.3)
     made = plan(body, law, np.array([0, 0.02]), CONFIG, dtype=F64)
@@ -151,7 +152,7 @@ def test_cantilever_swings_with_its_frequency_and_is_read_back(taichi, tmp_path)
     times, scene = np.arange(0, 0.25, 5e-3), bar()
     errors = []
     for cells in (3, 4):
-        body = simulated_body(scene, scene.runs[0], CONFIG, particle_spacing=0.015 / cells)
+        body = marked_body(scene, scene.runs[0], CONFIG, particle_spacing=0.015 / cells)
         tip = simulated_markers(body, law, times, CONFIG)
         hz, decay, amplitude = swing(times, tip[:, 0, 0], theory)
         errors.append(abs(hz / theory - 1))
@@ -171,7 +172,7 @@ def test_cantilever_swings_with_its_frequency_and_is_read_back(taichi, tmp_path)
     }))  # fmt: skip
     read = read_tracks(tmp_path)
     np.testing.assert_allclose(read.runs[0].positions, tip, atol=1e-9)
-    again = simulated_body(read, read.runs[0], CONFIG, particle_spacing=0.015 / 4)
+    again = marked_body(read, read.runs[0], CONFIG, particle_spacing=0.015 / 4)
     torch.testing.assert_close(again.particles, body.particles)
     np.testing.assert_allclose(simulated_markers(again, law, times, CONFIG), tip, atol=2e-6)
 

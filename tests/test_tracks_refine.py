@@ -16,12 +16,14 @@ from test_tracks_group import Ball, write_scene
 from masiv.cli import main
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
-from masiv.identify.tracks import family_of, fit_law, simulation_of
+from masiv.identify.tracks import fit_law, simulation_of
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.clamped_body import BodySimulation
-from masiv.models.free_body import Model
-from masiv.models.marker_body import simulated_body, simulated_markers
+from masiv.models.base import Model
+from masiv.models.clamped_body import ClampedBodyModel
+from masiv.models.families import family_of
+from masiv.models.marked_body import marked_body
+from masiv.models.marker_body import simulated_markers
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.add_effect import refit
@@ -63,7 +65,7 @@ def write_bar(folder: Path, runs) -> Path:
     tracks = read_tracks(folder)
     for seed, (name, condition, _) in enumerate(runs):
         run = next(r for r in tracks.runs if r.name == name)
-        body = simulated_body(tracks, run, SIMULATOR, particle_spacing=(9e-5 / PARTICLES) ** (1 / 3))
+        body = marked_body(tracks, run, SIMULATOR, particle_spacing=(9e-5 / PARTICLES) ** (1 / 3))
         members = [(effect_named("viscosity"), torch.tensor([VISCOSITY]))]
         if condition == "load":
             tip = body.particles[:, 2].max().item()
@@ -138,7 +140,7 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
 def test_a_static_deflection_strains_as_it_moves(bar):
     """F is the gradient of the displacement, and a section turns without shear."""
     run = next(r for r in bar.runs if r.name == "own_a")
-    body = simulated_body(bar, run, SIMULATOR, particle_spacing=5e-3)
+    body = marked_body(bar, run, SIMULATOR, particle_spacing=5e-3)
     axes = clamp_axes(body.gravity, body.normals)
     x, gradient = static_deflection(body.particles, body.heights[0], axes, 2e-3)
     before = body.particles
@@ -192,7 +194,7 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
     term = simulation.term("point_mass")
     places = tuple(sorted(term.guesses, key=lambda place: place[2]))  # along the bar, from the clamp
     coarse = replace(term, guesses=(places[0], places[-1]))
-    simulation.term = lambda name: coarse if name == "point_mass" else BodySimulation.term(simulation, name)
+    simulation.term = lambda name: coarse if name == "point_mass" else ClampedBodyModel.term(simulation, name)
     base = gauss_newton_fit(
         simulation, Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",)), {}, budget=4
     )

@@ -18,16 +18,17 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.identify.classical_fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
+from masiv.identify.problem import Problem
 from masiv.identify.start import _effort, choose_start
+from masiv.models.base import Model
 from masiv.models.families import FAMILIES
-from masiv.models.free_body import Model, Simulation, parameters
+from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import InitialState
-from masiv.models.prepare import video_observation
-from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import DONE, baselines, derived
 from masiv.refine.config import RefineConfig
+from masiv.refine.prepare import prepare
 from masiv.refine.tasks import map_tasks, ranked
 from masiv.workers import TaskError, Workers, processes_wanted, unwrap
 
@@ -169,8 +170,8 @@ def small_simulation():
     first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
     config = RefineConfig(particles=200, samples_per_frame=1, laws=["neo_hookean"])
     contact = IdentifyConfig(contact="sticky")
-    observation, *_ = video_observation("run", scene(), first, motion, contact, SimulatorConfig(), config)
-    return Simulation([observation]), config
+    setup, *_ = prepare("run", scene(), first, motion, contact, SimulatorConfig(), config)
+    return FreeBodyModel([setup]), config
 
 
 def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
@@ -192,10 +193,10 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
     simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
-    values = {p.name: p.start for p in parameters(model, simulation.observations)}
+    values = {p.name: p.start for p in simulation.parameters(model)}
     values |= {f"velocity_{a}@run": v for a, v in zip("xyz", VELOCITY, strict=True)}
     values |= {f"omega_{a}@run": v for a, v in zip("xyz", OMEGA, strict=True)}
-    simulation.settle(model, values)
+    simulation.hold_substeps(model, values)
     names = ["linear_drag", "gravity_scale"]
     found = []
     for workers in (Workers(1), two):

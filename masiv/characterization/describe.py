@@ -108,20 +108,23 @@ def describe_twin(
     data there are. Rollouts are of at most ``particles`` of the twin's.
     """
     from masiv import runtime
-    from masiv.simulation.simulate import march, simulate
+    from masiv.simulation.free_body import iterate_states
+    from masiv.simulation.simulate import simulate
 
     chosen = kd_tree_subset(twin.positions.astype(np.float64), particles)
-    few = replace(twin, positions=twin.positions[chosen], simulator=twin.simulator.model_copy(update={"split": 1}))
+    coarse = replace(
+        twin.with_body(particles=twin.positions[chosen]), simulator=twin.simulator.model_copy(update={"split": 1})
+    )
     done = 0
 
     def reroll(law: Law) -> np.ndarray:
         nonlocal done
         done += 1
         progress("describe", done, 6)
-        return simulate(replace(few, law=law), frames=frames, fps=twin.fps).positions
+        return simulate(coarse.with_body(law=law), frames=frames, fps=twin.fps).positions
 
     with runtime.torch_threads(1):
-        excited = excited_range(march(few, frames=frames, fps=twin.fps))
+        excited = excited_range(iterate_states(coarse, frames=frames, fps=twin.fps))
         progress("describe", 0, 6)
         material = describe(twin.law, excited)
         residual = None

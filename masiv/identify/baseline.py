@@ -21,11 +21,11 @@ from masiv.identify.fit import fit as fit_weights
 from masiv.identify.found import Found, history_rows
 from masiv.identify.judged import nearest_first, picture_errors_of
 from masiv.identify.polish import wanted
+from masiv.identify.problem import Problem
 from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.models.families import FAMILIES
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
 from masiv.workers import TaskError, Workers, processes_wanted
 

@@ -15,15 +15,22 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError, NonFiniteError
+from masiv.identify.geometry_loss import mean_distance
 from masiv.identify.misfit import Misfit
 from masiv.identify.objective import objective
-from masiv.inference.correlation import effective_samples
-from masiv.inference.least_squares import FIRST_STEP, Estimate, covariance, fit_parameters, robust_cost, robust_weight
+from masiv.identify.problem import PathResidual, Problem
+from masiv.inference.least_squares import (
+    Estimate,
+    clipped_step,
+    covariance,
+    gauss_newton,
+)
+from masiv.inference.noise_model import effective_samples
+from masiv.inference.robust import soft_l1_sum, soft_l1_weight
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.families import FAMILIES, Family, Rollouts, law_of, mean_distance
+from masiv.models.families import FAMILIES, Family, law_of
 from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.models.parameters import Parameter
-from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 RECONSIDERED = 3
@@ -83,7 +90,7 @@ def search(problem: Problem, family: Family, motion: InitialState, progress: Pro
     def tried(index: int, contact: str) -> None:
         values = {**candidates[index], **throw}
         try:
-            field = Rollouts(problem, family, contact, problem.frames).field(values)
+            field = PathResidual(problem, family, contact, problem.frames).field(values)
             distance = mean_distance(field)
             moved = torch.from_numpy(field).float() + problem.targets[: len(field)]
             error = objective(problem, moved) if pictures else distance
@@ -175,7 +182,7 @@ def _stage(
     parameters = _parameters(problem, family, found)
     # What a pixel may be off by is bounded, and most are not off at all: their median says nothing.
     robust = not misfit.pictures
-    estimate = fit_parameters(residual, parameters, max_evaluations=budget, robust=robust, tolerance=LEAST_GAIN)
+    estimate = gauss_newton(residual, parameters, max_evaluations=budget, robust=robust, tolerance=LEAST_GAIN)
     found = _updated(problem, found, _of_paths(estimate, misfit), stage)
     progress(label, budget, budget, f"{1e3 * found.error_m:.1f} mm")
     return found
@@ -208,7 +215,7 @@ def fit_all_particles(
     parameters = _parameters(coarse, family, found)
     progress(label, 0, total)
     on_few = Misfit(coarse, family, found.contact, coarse.frames, pictures=pictures)
-    chord = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
+    chord = gauss_newton(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not pictures)
     progress(label, 1, total)
     misfit = Misfit(problem, family, found.contact, problem.frames, pictures=pictures, chosen=coarse.chosen)
     softness = math.inf if pictures else max(1.4826 * float(np.median(np.abs(chord.residual))), 1e-12)
@@ -216,12 +223,12 @@ def fit_all_particles(
     best, residual = misfit(values)
     progress(label, 2, total, f"{1e3 * mean_distance(best):.1f} mm")
     for step in range(CHORD_STEPS):
-        weight = robust_weight(residual, softness)
+        weight = soft_l1_weight(residual, softness)
         full = np.linalg.lstsq(jacobian * weight[:, None], -residual * weight, rcond=None)[0]
-        moved = _moved(parameters, values, scale * full)
+        moved = clipped_step(parameters, values, scale * full)
         try:
             paths, tried = misfit(moved)
-            cost, before = (robust_cost(r, softness) for r in (tried, residual))
+            cost, before = (soft_l1_sum(r, softness) for r in (tried, residual))
         except NonFiniteError:
             cost, before = math.inf, 1.0
         if cost < before:
@@ -231,7 +238,7 @@ def fit_all_particles(
         else:
             scale *= 0.5
         progress(label, 3 + step, total, f"{1e3 * mean_distance(best):.1f} mm")
-    weight = robust_weight(residual, softness)
+    weight = soft_l1_weight(residual, softness)
     spread = covariance(jacobian * weight[:, None], residual * weight)
     estimate = Estimate(values, spread, jacobian, residual, chord.evaluations + CHORD_STEPS + 1, tuple(parameters))
     found = _updated(coarse, found, _of_paths(estimate, misfit), 4)
@@ -239,15 +246,6 @@ def fit_all_particles(
     keep(checkpoint, found, f"{found.kind}, {ALL}")
     progress(label, total, total, f"{1e3 * found.error_m:.1f} mm")
     return found
-
-
-def _moved(parameters: list[Parameter], values: dict[str, float], step: np.ndarray) -> dict[str, float]:
-    """``values`` after a step in the fitted scales, no longer than a linear model deserves, within the bounds."""
-    out = {}
-    for p, delta in zip(parameters, step, strict=True):
-        limit = FIRST_STEP * p.step
-        out[p.name] = p.value(p.fitted(values[p.name]) + float(np.clip(delta, -limit, limit)))
-    return out
 
 
 def information_criteria(fits: list[FamilyFit]) -> dict[str, float]:
@@ -270,7 +268,7 @@ def _parameters(problem: Problem, family: Family, found: FamilyFit) -> list[Para
 def _updated(problem: Problem, found: FamilyFit, estimate: Estimate, stage: int) -> FamilyFit:
     """``found`` with what ``estimate``, whose residual is of paths [m], says."""
     residual = estimate.residual.reshape(-1, problem.count, 3)
-    samples = effective_samples(residual, problem.start.double().numpy())
+    samples = effective_samples(residual, problem.particles.double().numpy())
     return replace(
         found,
         values=estimate.values,

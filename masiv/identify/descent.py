@@ -60,7 +60,7 @@ class Descent:
         return all(bool(torch.isfinite(p.grad).all()) for p in self._parameters if p.grad is not None)
 
     def accept(self) -> None:
-        """Rollouts of the parameters as they are have succeeded."""
+        """PathResidual of the parameters as they are have succeeded."""
         self._accepted = [p.detach().clone() for p in self._parameters]
 
     def step(self) -> None:

@@ -18,11 +18,11 @@ from masiv.errors import MasivError, NonFiniteError
 from masiv.identify.descent import Descent
 from masiv.identify.objective import objective
 from masiv.identify.pictures import compared, picture_errors, picture_objective
+from masiv.identify.problem import Problem
 from masiv.identify.throw import Throw
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from masiv.errors import NonFiniteError
 from masiv.identify.classical_fit import FamilyFit, ranked
 from masiv.identify.pictures import compared, picture_objective, shown
+from masiv.identify.problem import Problem
 from masiv.identify.start import TELLS
-from masiv.models.problem import Problem
 
 
 def picture_errors_of(problem: Problem, fits: Sequence[FamilyFit]) -> dict[str, float]:

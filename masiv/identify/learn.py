@@ -11,10 +11,10 @@ from masiv.checkpoint import Checkpoint
 from masiv.identify.fit import Fit, fit, fit_from, fit_state
 from masiv.identify.found import Found, history_rows
 from masiv.identify.polish import polish, wanted
+from masiv.identify.problem import Problem
 from masiv.identify.start import Start, best_first, choose_start
 from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
 from masiv.workers import TaskError, Workers, processes_wanted, run_task, unwrap
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from masiv.identify.pictures import VIEWS, beside_pictures, some_of_each
-from masiv.models.families import Family, Rollouts
-from masiv.models.problem import Problem
+from masiv.identify.problem import PathResidual, Problem
+from masiv.models.families import Family
 
 
 class Misfit:
@@ -27,7 +27,7 @@ class Misfit:
         *, pictures: bool, chosen: np.ndarray | None = None,
     ) -> None:  # fmt: skip
         self.problem = problem
-        self.rollouts = Rollouts(problem, family, contact, frames)
+        self.rollouts = PathResidual(problem, family, contact, frames)
         self.frames = frames
         self.pictures = pictures
         self.chosen = np.arange(problem.count) if chosen is None else chosen
@@ -39,7 +39,7 @@ class Misfit:
         return squared[: self.rows] / self.per_metre
 
     def __call__(self, values: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-        """Raises NonFiniteError as ``Rollouts.field``."""
+        """Raises NonFiniteError as ``PathResidual.field``."""
         paths = self.rollouts.field(values)
         parts = [self.per_metre * paths[:, self.chosen].ravel()]
         if self.pictures:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from masiv.identify.pictures import compared, picture_errors, picture_objective, some_of_each
-from masiv.models.problem import Problem
+from masiv.identify.problem import Problem
 
 
 @torch.no_grad()

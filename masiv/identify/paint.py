@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from masiv.identify.pictures import Window, drawn, to_world, window
-from masiv.models.problem import Problem
+from masiv.identify.problem import Problem
 
 SWEEPS = 12
 BRUSH = 0.5
@@ -46,7 +46,7 @@ def paint(problem: Problem) -> Paint:
     is missing in the pixels that it makes up (SIRT, Gilbert 1972).
     """
     count, size = problem.count, BRUSH * (problem.volume / problem.count) ** (1 / 3)
-    points = to_world(problem, problem.start)
+    points = to_world(problem, problem.particles)
     windows = [window(problem.scene, view, 0) for view in problem.scene.views]
     colours = torch.full((count, 3), 0.5, requires_grad=True)
     weight = torch.zeros(count)

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
+from masiv.identify.problem import Problem
 from masiv.materials.law import Law
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 from masiv.splat.rasteriser import Rendering, render
@@ -66,7 +66,7 @@ def blob_size(problem: Problem) -> float:
     a tenth too many pixels at half a spacing), and a law that is fitted to such silhouettes learns to shrink the body.
     """
     spacing = (problem.volume / problem.count) ** (1 / 3)
-    points, nothing = to_world(problem, problem.start), torch.zeros(problem.count, 3)
+    points, nothing = to_world(problem, problem.particles), torch.zeros(problem.count, 3)
 
     @functools.lru_cache
     @torch.no_grad()

@@ -14,9 +14,9 @@ import torch
 from masiv.checkpoint import Checkpoint
 from masiv.identify.fit import Fit, fit
 from masiv.identify.pictures import compared, picture_objective, shown
+from masiv.identify.problem import Problem
 from masiv.identify.throw import Throw
 from masiv.materials.neural import NeuralLaw
-from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 

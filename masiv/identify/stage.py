@@ -14,12 +14,13 @@ from masiv.continuum.trajectory import Trajectory
 from masiv.identify.baseline import identify_classical
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.learn import learn
+from masiv.identify.problem import Problem
 from masiv.identify.throw import Throw, throw_of
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
+from masiv.simulation.twin_effects import effect_members
 from masiv.subsample import random_subset
 from masiv.twin import Twin
 
@@ -70,14 +71,14 @@ def _identify(
         found = identify_classical(
             first.problem, coarse(), first.motion, first.first_frames, seed, checkpoint, progress
         )  # fmt: skip
-    return Twin(
+    return Twin.of_body(
+        observation=scene.path.resolve().name,
         positions=np.asarray(trajectory.positions[0], dtype=np.float32),
         velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
         omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
         gravity=np.asarray(scene.gravity, dtype=np.float64),
         ground=found.motion.ground(scene.ground),
         contact=found.contact,
-        friction=0.0,
         volume=trajectory.volume,
         density=scene.density,
         up=np.asarray(scene.up, dtype=np.float64),
@@ -110,7 +111,7 @@ def relearn(
 
     Raises MasivError where no law explains ``trajectory``.
     """
-    made = functools.partial(Problem, scene, trajectory, config, twin.simulator, known=twin.effects)
+    made = functools.partial(Problem, scene, trajectory, config, twin.simulator, known=effect_members(twin, twin.body))
     chosen = random_subset(trajectory.positions.shape[1], config.search_particles, seed)
     problem, coarse = made(), functools.partial(made, chosen=chosen)
     axes = problem.axes
@@ -119,12 +120,8 @@ def relearn(
     with runtime.torch_threads(1):
         throw = Throw(problem, motion, (problem.frames + 1) // 2)
         found = learn([throw], coarse, seed, checkpoint or Checkpoint(None), progress)
-    return replace(
-        twin,
-        velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
-        omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
-        ground=found.motion.ground(scene.ground),
-        contact=found.contact,
-        law=found.law,
-        fit={**twin.fit, **found.report, "trajectory_error_mm": 1e3 * found.error_m, "history": found.history},
-    )
+    velocity, omega = (axes.vectors_to_world(v.double().numpy()) for v in (found.motion.velocity, found.motion.omega))
+    learned = twin.with_body(law=found.law).with_motion(velocity=velocity, omega=omega)
+    learned = learned.with_boundary(ground=found.motion.ground(scene.ground), contact=found.contact)
+    errors = {"trajectory_error_mm": 1e3 * found.error_m, "history": found.history}
+    return replace(learned, fit={**twin.fit, **found.report, **errors})

@@ -15,10 +15,10 @@ from scipy.optimize import minimize
 from masiv.errors import InputError, MasivError
 from masiv.identify.objective import objective
 from masiv.identify.pictures import compared
+from masiv.identify.problem import Problem
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.pretraining.pretrain import MATERIALS, pretrained_path
 from masiv.progress import Progress
 from masiv.workers import Workers, unwrap

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.config import IdentifyConfig
+from masiv.identify.problem import Problem
 from masiv.models.initial_state import InitialMotion, InitialState, estimate_initial_motion
-from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Scene
 

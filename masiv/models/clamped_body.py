@@ -24,12 +24,12 @@ from masiv.models.cache import Arrays, RolloutCache
 from masiv.models.deformable import HeldSubsteps, failures_as_divergence
 from masiv.models.marked_body import MarkedBody, marked_body
 from masiv.models.parameters import Parameter
-from masiv.models.point_mass import drag_body
 from masiv.models.release import fit_release
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.base import rms_mm
-from masiv.observations.tracks import TracksObservation, marker_observation, released_at
+from masiv.observations.tracks import TracksObservation, marker_observation
 from masiv.tracks.tracks import Run, Tracks
+from masiv.twin.from_tracks import drag_body
 
 RELEASE_RANGE, RELEASE_STEP = 0.03, 1e-3
 """Of the delay of the release: range to either side and finite-difference step [s]."""
@@ -55,18 +55,20 @@ its sizes."""
 def run_of_body(
     tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, duration: float, skipped: float = 0.0
 ) -> tuple[TracksObservation, MarkedBody]:
-    """``run`` from ``skipped`` to ``duration`` [s] after its release, and its body with particles ``spacing`` [m] apart.
-    Raises InputError."""
-    released_at(tracks, run)
+    """``run`` from ``skipped`` to ``duration`` [s] after its release, and its body with particles ``spacing`` [m]
+    apart. Raises InputError."""
     body = marked_body(tracks, run, config, particle_spacing=spacing)
     points = body.markers_to_world(body.particles[None])[0]
-    observation = marker_observation(tracks, run, body.markers, points, duration, skipped)
-    moved = np.linalg.norm(np.diff(observation.values, axis=0), axis=2).max()
-    return observation, replace(body, speed=float(moved / np.diff(observation.times).min()))
+    speed = run.released(body.markers, skipped, duration)[2]
+    return marker_observation(run, body.markers, points, duration, skipped), replace(body, speed=speed)
 
 
 class ClampedBodyModel(ForwardModel):
-    """Runs of one body."""
+    """Runs of one body.
+
+    It has no finer grids: over many periods two of them are out of phase, which would hide all else
+    (benchmarks/measured.md).
+    """
 
     observations: Sequence[TracksObservation]
 
@@ -97,6 +99,11 @@ class ClampedBodyModel(ForwardModel):
     def contact(self) -> str:
         """With the ground."""
         return "sticky" if self.tracks.ground is not None else "none"
+
+    @property
+    def config(self) -> SimulatorConfig:
+        """Of the simulator."""
+        return self.body(self.observations[0]).config
 
     def over(self, observations: Sequence[TracksObservation]) -> ClampedBodyModel:
         """A model of other parts of the same runs, which holds a substep of its own."""
@@ -263,8 +270,6 @@ class ClampedBodyModel(ForwardModel):
             run.residual(self.markers(run, model, values) if run.fitted or held_out else run.values[:0])
             for run in self.observations
         ]
-
-    # Finer grids: none. Over many periods two grids are out of phase, which would hide all else (benchmarks/measured.md).
 
     def curriculum(self, fields: Sequence[np.ndarray]) -> Sequence[ClampedBodyModel]:
         """The first moments, then ever more, if the phase is lost. Empty if those are left out: an effective start

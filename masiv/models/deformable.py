@@ -175,8 +175,8 @@ class HeldSubsteps:
 
 @contextmanager
 def failures_as_divergence() -> Iterator[None]:
-    """A law that cannot be simulated (too many substeps, a body that spreads without bound) counts as one that diverges:
-    MasivError becomes NonFiniteError, which fits step back from. InputError stays."""
+    """A law that cannot be simulated (too many substeps, a body that spreads without bound) counts as one that
+    diverges: MasivError becomes NonFiniteError, from which fits step back. InputError stays."""
     try:
         yield
     except (InputError, NonFiniteError):

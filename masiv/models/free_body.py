@@ -28,8 +28,8 @@ VISIBLE_ERROR = 0.05
 
 
 @dataclass(frozen=True)
-class Recording:
-    """A video of the body, ready to be simulated.
+class FreeBodySetup:
+    """A recording of the body, ready to be simulated.
 
     body: the particles that are compared. finer: all particles of the same motion on finer grids. start: estimate of
     the initial state; flight: the last frame of free flight, from which it is. ground_range [m]: greatest offset of the
@@ -52,17 +52,17 @@ class FreeBodyModel(ForwardModel):
 
     observations: Sequence[VideoObservation]
 
-    def __init__(self, recordings: Sequence[Recording], held: HeldSubsteps | None = None) -> None:
+    def __init__(self, setups: Sequence[FreeBodySetup], held: HeldSubsteps | None = None) -> None:
         """held: substeps to go on with. Raises ValueError for equal names."""
-        super().__init__([r.observation for r in recordings])
-        self.recordings = tuple(recordings)
+        super().__init__([r.observation for r in setups])
+        self.setups = tuple(setups)
         self.held = held or HeldSubsteps()
-        self._kept = [RolloutCache(1) for _ in recordings]
+        self._kept = [RolloutCache(1) for _ in setups]
 
     def hold_substeps(self, model: Model, values: Mapping[str, float]) -> None:
         """Hold the substeps of the model's family at what its law with ``values`` needs, if they are not held yet."""
         law = law_of(model.family, values)
-        for index, r in enumerate(self.recordings):
+        for index, r in enumerate(self.setups):
             r.body.held_substeps(law, self.held, (index, model.family.kind))
 
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
@@ -71,7 +71,7 @@ class FreeBodyModel(ForwardModel):
         gone = {effect_named(name).replaces_parameter for name in model.effects}
         own = [
             replace(p, name=f"{p.name}@{e.name}")
-            for e, r in zip(self.observations, self.recordings, strict=True)
+            for e, r in zip(self.observations, self.setups, strict=True)
             for p in initial_state_parameters(r.start, r.ground_range)
             if p.name not in gone
         ]
@@ -97,7 +97,7 @@ class FreeBodyModel(ForwardModel):
 
     def term(self, name: str) -> EffectTerm:
         """The effect on everything; its guesses are from the fitted frames of the first recording."""
-        term = plain_term(name, self.recordings[0].body.context(self.observations[0].fit_frames))
+        term = plain_term(name, self.setups[0].body.context(self.observations[0].fit_frames))
         instead = effect_named(name).replaces_parameter
         replaced = () if instead is None else tuple(f"{instead}@{e.name}" for e in self.observations)
         return replace(term, replaces_parameter=replaced)
@@ -106,7 +106,7 @@ class FreeBodyModel(ForwardModel):
         """``values`` with each initial state as it was estimated from free flight."""
         starts = {
             f"{p.name}@{e.name}": p.start
-            for e, r in zip(self.observations, self.recordings, strict=True)
+            for e, r in zip(self.observations, self.setups, strict=True)
             for p in initial_state_parameters(r.start, r.ground_range)
         }
         return {name: starts.get(name, value) for name, value in values.items()}
@@ -114,7 +114,7 @@ class FreeBodyModel(ForwardModel):
     def curriculum(self, fields: Sequence[np.ndarray]) -> list[FreeBodyModel]:
         """First the frames until the error is visible, free flight at least; then half of the rest."""
         horizons = []
-        for e, r, field in zip(self.observations, self.recordings, fields, strict=True):
+        for e, r, field in zip(self.observations, self.setups, fields, strict=True):
             error = np.sqrt((field[: e.fit_count] ** 2).sum(2).mean(1)) / r.body.size
             if error[-1] < OUT_OF_REACH:
                 return []
@@ -123,13 +123,13 @@ class FreeBodyModel(ForwardModel):
         shorter = []
         for k in range(2):
             cut = [e.with_fit_frames(h[k]) for e, h in zip(self.observations, horizons, strict=True)]
-            shorter.append(FreeBodyModel(self.recordings, self.held).with_observations(cut))
+            shorter.append(FreeBodyModel(self.setups, self.held).with_observations(cut))
         return shorter
 
     def objections(self, before: FittedModel, after: FittedModel, term: EffectTerm, min_gain: float) -> list[str]:
         """Whether the fitted frames are too few to tell the effect from others."""
         theta = torch.tensor([after.values[p.name] for p in term.parameters])
-        times = [e.fit_frames / r.body.scene.fps for e, r in zip(self.observations, self.recordings, strict=True)]
+        times = [e.fit_frames / r.body.scene.fps for e, r in zip(self.observations, self.setups, strict=True)]
         places = torch.cat([torch.as_tensor(e.seen_at_frames()).reshape(-1, 3) for e in self.observations])
         reason = effect_named(term.effect).identifiability_issue(theta, max(times), places)
         return [] if reason is None else [reason]
@@ -152,7 +152,7 @@ class FreeBodyModel(ForwardModel):
         key = (model.family.kind, model.contact, model.effects, own, frames)
 
         def rolled_out() -> dict[str, np.ndarray]:
-            body, law = self.recordings[index].body, law_of(model.family, values)
+            body, law = self.setups[index].body, law_of(model.family, values)
             start, effects = self.initial_state(values, index), self.active(model, values, body)
             with failures_as_divergence():
                 steps = body.held_substeps(law, self.held, (index, model.family.kind))
@@ -176,7 +176,7 @@ class FreeBodyModel(ForwardModel):
     @torch.no_grad()
     def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
         """See ``ForwardModel``: each with all particles."""
-        r = self.recordings[index]
+        r = self.setups[index]
         own = self.positions(model, values, index, r.body.frames)
         law, start = law_of(model.family, values), self.initial_state(values, index)
         runs = (

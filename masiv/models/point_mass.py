@@ -1,21 +1,20 @@
 """Light rigid bodies in flight, each a mass point: what several of them share, and what each has of its own.
 
-Gravity, wind and the like are shared by all; a drag is shared by all or belongs to one kind. A held-out run is predicted
-from its own place and velocity at its first frame, which say nothing of the physics; all else comes from the fitted
-runs.
+Gravity, wind and the like are shared by all; a drag is shared by all or belongs to one kind. A held-out run is
+predicted from its own place and velocity at its first frame, which say nothing of the physics; all else comes from the
+fitted runs.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 
 from masiv.effects.catalogue import causes, effect_named
-from masiv.effects.effect import DragBody, Effect, EffectContext, EffectParameter
-from masiv.errors import InputError, NonFiniteError
+from masiv.effects.effect import Effect, EffectContext, EffectParameter
+from masiv.errors import NonFiniteError
 from masiv.kernels.points import point_kernels
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model, plain_term
 from masiv.models.families import Family
@@ -23,8 +22,8 @@ from masiv.models.parameters import Parameter
 from masiv.observations.base import rms_mm
 from masiv.observations.tracks import TracksObservation
 from masiv.scene.transforms import SimulationFrame
-from masiv.tracks.geometry import Geometry
-from masiv.tracks.tracks import Body, Tracks
+from masiv.tracks.tracks import Tracks
+from masiv.twin.from_tracks import drag_body
 
 RIGID = Family("rigid", (), {})
 """The law of a body that does not deform: nothing to fit."""
@@ -56,23 +55,6 @@ def flight_parameters(run: TracksObservation) -> tuple[Parameter, ...]:
     return tuple(out)
 
 
-def drag_body(tracks: Tracks, body: Body) -> DragBody:
-    """A body as the medium sees it. Raises InputError if its geometry or mass is not known."""
-    if body.geometry is None or body.mass is None:
-        raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass")
-    return DragBody(mean_diameter(body.geometry), body.mass, tracks.medium_density, tracks.medium_viscosity)
-
-
-def mean_diameter(geometry: Geometry) -> float:
-    """Of the sphere [m] with the mean frontal area of a convex body, a quarter of its surface (Cauchy 1841); of a sphere
-    its own."""
-    if geometry.kind == "sphere":
-        return geometry.size
-    a, b, c = (geometry.vertices[geometry.faces[:, k]] for k in range(3))
-    surface = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    return math.sqrt(surface / math.pi)
-
-
 class PointMassModel(ForwardModel):
     """Mass points of a group under gravity and effects."""
 
@@ -82,7 +64,8 @@ class PointMassModel(ForwardModel):
         self, tracks: Tracks, runs: Sequence[TracksObservation], known: Mapping[str, float] | None = None,
         substep: float = LONGEST_SUBSTEP,
     ) -> None:  # fmt: skip
-        """runs: see ``flight_observations``. known: parameters of effects that are not fitted. substep [s]: the longest."""
+        """runs: see ``flight_observations``. known: parameters of effects that are not fitted. substep [s]: the
+        longest."""
         super().__init__(runs)
         self.tracks = tracks
         self.known = dict(known or {})
@@ -166,7 +149,9 @@ class PointMassModel(ForwardModel):
         return EffectContext(torch.as_tensor(self.gravity), rest, body.mass, body.diameter,
                        float(run.times[-1]), frame_time)  # fmt: skip
 
-    def members(self, model: Model, values: Mapping[str, float], run: TracksObservation) -> list[tuple[Effect, np.ndarray]]:
+    def members(
+        self, model: Model, values: Mapping[str, float], run: TracksObservation
+    ) -> list[tuple[Effect, np.ndarray]]:
         """Effects of ``model`` with their coefficients for ``run``, zero strength where none acts on its body."""
         setting, out, values = self._context(run), [], {**self.known, **values}
         for name in dict.fromkeys(self.term(n).effect for n in model.effects):
@@ -192,21 +177,11 @@ class PointMassModel(ForwardModel):
         world = np.zeros((len(starts), 2, 3))
         for k, axis in enumerate(run.axes):
             world[:, :, axis] = starts[:, 2 * k : 2 * k + 2]
-        begin = np.concatenate(
-            [self.frame.points_to_simulation(world[:, 0]), self.frame.vectors_to_simulation(world[:, 1])], axis=1
-        )
-        gaps = np.diff(run.times, prepend=run.times[0])
-        counts = np.maximum(np.ceil(gaps / self.substep), 1).astype(np.int32)
-        out = np.zeros((len(starts), len(run.times), 3))
-        coefficients = np.concatenate([c for _, c in members] or [np.zeros(1)])
-        kernels = point_kernels(tuple((effect, len(c)) for effect, c in members))
-        kernels.fly(
-            np.ascontiguousarray(begin), np.ascontiguousarray(self.gravity, dtype=np.float64),
-            np.tile(coefficients, (len(starts), 1)), run.times.astype(np.float64), counts, self.drag_bodies[run.body].diameter, out,
-        )  # fmt: skip
-        if not np.isfinite(out).all():
+        diameter = self.drag_bodies[run.body].diameter
+        paths = fly(self.frame, self.gravity, members, world, run.times, diameter, self.substep)
+        if not np.isfinite(paths).all():
             raise NonFiniteError(0, 0, f"the flight of {run.name} is not finite")
-        return self.frame.points_to_world(out)[:, :, list(run.axes)]
+        return paths[:, :, list(run.axes)]
 
     def start_of(self, run: TracksObservation, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Place and velocity (2A,) at the first frame: among ``values``, or for a held-out run those nearest to it."""
@@ -258,3 +233,32 @@ class PointMassModel(ForwardModel):
         """What the medium cannot do to ``body``."""
         theta = torch.tensor([fitted.values[p.name] for p in self.own(term, body)], dtype=torch.float64)
         return effect_named(term.effect).violates_bounds(theta, self.drag_bodies[body])
+
+
+def fly(
+    frame: SimulationFrame,
+    gravity: np.ndarray,
+    members: list[tuple[Effect, np.ndarray]],
+    starts: np.ndarray,
+    times: np.ndarray,
+    diameter: float,
+    substep: float = LONGEST_SUBSTEP,
+) -> np.ndarray:
+    """Places (B, K, 3) [m, world] of a mass point at ``times`` (K,) [s], the first of which is the start.
+
+    starts (B, 2, 3): place [m] and velocity [m/s], world; gravity (3,) [m/s^2, simulation frame]; members: effects with
+    their coefficients; diameter [m]; substep [s]: an upper bound.
+    """
+    begin = np.concatenate(
+        [frame.points_to_simulation(starts[:, 0]), frame.vectors_to_simulation(starts[:, 1])], axis=1
+    )
+    gaps = np.diff(times, prepend=times[0])
+    counts = np.maximum(np.ceil(gaps / substep), 1).astype(np.int32)
+    out = np.zeros((len(starts), len(times), 3))
+    coefficients = np.concatenate([c for _, c in members] or [np.zeros(1)])
+    kernels = point_kernels(tuple((effect, len(c)) for effect, c in members))
+    kernels.fly(
+        np.ascontiguousarray(begin), np.ascontiguousarray(gravity, dtype=np.float64),
+        np.tile(coefficients, (len(starts), 1)), times.astype(np.float64), counts, diameter, out,
+    )  # fmt: skip
+    return frame.points_to_world(out)

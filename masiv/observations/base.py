@@ -59,14 +59,29 @@ class Observation:
         """Mean (T, N, A) [m] of ``grid_corrections``, a part of which may be added to a model."""
         return np.mean(self.grid_corrections, axis=0)
 
+    @property
+    def points_in_world(self) -> np.ndarray:
+        """``points`` (N, 3) [m, world]."""
+        return self.points
+
+    @property
+    def values_in_world(self) -> np.ndarray:
+        """``values`` (T, N, A) [m] along axes of the world."""
+        return self.values
+
+    def field_in_world(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, N, A) [m] along axes of the world."""
+        return field
+
     def residual(self, predicted: np.ndarray) -> np.ndarray:
         """Predicted less observed (K, N, A) [m] of the first K instants, 0 if nothing was measured. Raises ValueError
         for another shape of ``predicted`` (K, N, A)."""
         observed = self.values[: len(predicted)]
         if predicted.shape != observed.shape:
+            _, count, axes = self.values.shape
             raise ValueError(
-                f"observation {self.name}: a prediction has shape {predicted.shape}, it must be (K, {self.values.shape[1]}"
-                f", {self.values.shape[2]}) with K up to {len(self.values)}"
+                f"observation {self.name}: a prediction has shape {predicted.shape}, it must be (K, {count}, {axes}) "
+                f"with K up to {len(self.values)}"
             )
         field = predicted - observed
         return np.where(np.isnan(observed), 0.0, field) if np.isnan(observed).any() else field

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from masiv.errors import InputError
 from masiv.observations.base import Observation
-from masiv.tracks.tracks import Run, Tracks
+from masiv.tracks.tracks import MIN_SEEN_FRAMES, Run, Tracks
 
 MIN_NOISE = 1e-6
 """[m], about what single precision leaves of a position."""
-MIN_SEEN_FRACTION, MIN_FRAMES = 0.5, 6
-"""Frames in which all markers are seen: at least this part, and as many."""
 FLIGHT_DEGREE = 6
 """Degree of the polynomial that any smooth flight is taken for."""
 
@@ -48,37 +47,19 @@ class TracksObservation(Observation):
 
 
 def marker_observation(
-    tracks: Tracks, run: Run, markers: tuple[int, ...], points: np.ndarray, duration: float, skipped: float = 0.0
+    run: Run, markers: Sequence[int], points: np.ndarray, duration: float, skipped: float = 0.0
 ) -> TracksObservation:
-    """``run`` from ``skipped`` to ``duration`` [s] after its release: its ``markers`` (indices), which are at ``points``
-    (M, 3) [m, world] at rest, in the frames that show them all. Raises InputError."""
-    if not skipped < duration:
-        raise InputError(f"run {run.name}: unsteady: {skipped:g} s leaves nothing of tracks.duration {duration:g} s")
-    release = released_at(tracks, run)
-    cut = run.between(release + skipped, release + duration)
-    chosen = list(markers)
-    whole = np.asarray(np.isfinite(cut.positions[:, chosen]).all(axis=(1, 2)), bool)
-    if whole.mean() < MIN_SEEN_FRACTION or whole.sum() < MIN_FRAMES:
-        raise InputError(
-            f"{tracks.path}: run {run.name}: all of {', '.join(run.markers[m] for m in chosen)} are seen in "
-            f"{int(whole.sum())} of {len(whole)} frames: leave out with markers those that are rarely seen"
-        )
-    times = cut.elapsed[whole]
+    """``run`` from ``skipped`` to ``duration`` [s] after its release: its ``markers`` (indices), which are at
+    ``points`` (M, 3) [m, world] at rest, in the frames that show them all. Raises InputError."""
+    times, positions, _ = run.released(markers, skipped, duration)
     noise = MIN_NOISE
     if run.noise_std is not None:
-        noise = max(float(np.sqrt((run.noise_std[chosen] ** 2).sum(1).mean())), MIN_NOISE)
+        noise = max(float(np.sqrt((run.noise_std[list(markers)] ** 2).sum(1).mean())), MIN_NOISE)
     return TracksObservation(
-        name=run.name, times=times, points=points, values=cut.positions[whole][:, chosen],
+        name=run.name, times=times, points=points, values=positions,
         fit_count=len(times) if run.purpose == "fit" else 0, noise_std=noise, residual_std=np.full(len(times), noise),
         body=run.body, condition=run.condition, axes=(0, 1, 2), skipped=skipped,
     )  # fmt: skip
-
-
-def released_at(tracks: Tracks, run: Run) -> float:
-    """When ``run`` was let go [s]. Raises InputError if that is not known."""
-    if run.release is None:
-        raise InputError(f"{tracks.path}: run {run.name}: nobody knows when it was let go: give rest_frames")
-    return run.release
 
 
 def flight_observations(tracks: Tracks, group: str) -> tuple[TracksObservation, ...]:
@@ -103,9 +84,9 @@ def _flight(tracks: Tracks, run: Run) -> TracksObservation:
     moving = run.moving()
     axes = tuple(int(a) for a in np.flatnonzero(moving.axes[0]))
     seen = moving.seen[:, 0]
-    if seen.sum() < MIN_FRAMES:
+    if seen.sum() < MIN_SEEN_FRAMES:
         raise InputError(
-            f"{tracks.path}: run {run.name} has {int(seen.sum())} frames in flight: it needs {MIN_FRAMES} or more"
+            f"{tracks.path}: run {run.name} has {int(seen.sum())} frames in flight: it needs {MIN_SEEN_FRAMES} or more"
         )
     times = moving.times[seen]
     times = times - times[0]
@@ -119,8 +100,8 @@ def _flight(tracks: Tracks, run: Run) -> TracksObservation:
 
 
 def flight_noise(times: np.ndarray, places: np.ndarray) -> float:
-    """Root mean square distance [m] of a flight (K, A) at ``times`` (K,) [s] from the nearest polynomial: what no smooth
-    motion explains, a lower bound of the noise. A flight of few frames does not show it: it is then ``MIN_NOISE``."""
+    """Root mean square distance [m] of a flight (K, A) at ``times`` (K,) [s] from the nearest polynomial: what no
+    smooth motion explains, a lower bound of the noise. A flight of few frames does not show it: it is ``MIN_NOISE``."""
     if len(times) <= 2 * FLIGHT_DEGREE:
         return MIN_NOISE
     basis = np.polynomial.chebyshev.chebvander(2 * times / times[-1] - 1, FLIGHT_DEGREE)

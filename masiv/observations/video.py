@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from masiv.observations.base import Observation
+from masiv.scene.transforms import SimulationFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,6 +15,21 @@ class VideoObservation(Observation):
     """Particles at ``samples_per_frame`` instants a frame, frame 0 left out; simulation axes, float32."""
 
     samples_per_frame: int
+    simulation_axes: SimulationFrame
+
+    @property
+    def points_in_world(self) -> np.ndarray:
+        """See ``Observation``."""
+        return self.simulation_axes.points_to_world(self.points)
+
+    @property
+    def values_in_world(self) -> np.ndarray:
+        """See ``Observation``; float64."""
+        return self.simulation_axes.points_to_world(self.values.astype(np.float64))
+
+    def field_in_world(self, field: np.ndarray) -> np.ndarray:
+        """See ``Observation``."""
+        return self.simulation_axes.vectors_to_world(field)
 
     @property
     def frame_count(self) -> int:
@@ -27,8 +43,6 @@ class VideoObservation(Observation):
 
     def with_fit_frames(self, count: int) -> VideoObservation:
         """The same with ``count`` fitted frames after frame 0."""
-        from dataclasses import replace
-
         return replace(self, fit_count=count * self.samples_per_frame)
 
     def seen_at_frames(self) -> np.ndarray:

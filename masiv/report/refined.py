@@ -33,10 +33,11 @@ def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | No
     try:
         document = json.loads((run / REFINED).read_text(encoding="utf-8"))
         with np.load(run / FIELDS, allow_pickle=False) as file:
-            fields = {name: file[name] for name in ("before", "after", "positions", "times", "fitted")}
+            first = str(file["observations"][0])
+            fields = {name: file[f"{name}@{first}"] for name in ("before", "after", "points", "times", "fit_count")}
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise InputError(f"{run / REFINED} and {FIELDS} cannot be read ({error}): run masiv refine again") from error
-    if not isinstance(document, dict) or document.get("schema") != 1:
+    if not isinstance(document, dict) or document.get("schema") != 2:
         raise InputError(f"{run / REFINED} is of another version of masiv: run masiv refine again")
     return document, fields
 
@@ -58,8 +59,8 @@ def refine_section(run: Path, up: np.ndarray | None = None) -> str | None:
     _refits(page, document["rounds"])
     _before_after(page, document["before"], document["after"])
     _accepted(page, document["accepted"])
-    _unexplained(page, document["unexplained"], document.get("stop_gap"))
-    _next_throw(page, document.get("next_experiment"))
+    _unexplained(page, document["unexplained"], document["discrepancy_force"])
+    _next_experiment(page, document.get("next_experiment"))
     return "".join(page.parts)
 
 
@@ -82,7 +83,7 @@ def _verdict(document: Mapping[str, Any]) -> str:
 
 def _grid(document: Mapping[str, Any]) -> str:
     """How much of what finer grids change is in the motion that the residual is of; nothing where none was fitted."""
-    share = (document.get("grid_share") or {}).get("after")
+    share = document["grid_change"]["after"]
     if share is None:
         return ""
     return f" Simulated with few particles; {number(share)} of what finer grids change on average is added."
@@ -98,7 +99,7 @@ def _figures(page: Page, document: Mapping[str, Any], fields: Mapping[str, np.nd
     shown = {name if added else "without effects": fields[name] for name in names}
     times = fields["times"]
     page.picture(
-        plots.residual_in_time(shown, times, int(fields["fitted"]), document["noise_floor_mm"]), "residual in time"
+        plots.residual_in_time(shown, times, int(fields["fit_count"]), document["noise_floor_mm"]), "residual in time"
     )
     page.note(
         "What the added effect explains is the gap between the curves, also on held-out frames, which no fit saw; what "
@@ -106,7 +107,7 @@ def _figures(page: Page, document: Mapping[str, Any], fields: Mapping[str, np.nd
         if added
         else "A curve near the dashed line leaves nothing to explain; one that grows away from it is missing physics."
     )
-    page.picture(plots.residual_in_space(shown, fields["positions"], times, up), "residual in space")
+    page.picture(plots.residual_in_space(shown, fields["points"], times, up), "residual in space")
     page.note(
         "Particles at frame 0. An even colour is an error of the whole body, a bright spot one of a part; arrows point "
         "from the observed to the simulated position."
@@ -194,7 +195,7 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
                 _number(value),
                 _number(a["stderr"].get(n)),
                 _unit(a["unit"].get(n, "")),
-                ", ".join(map(words, a.get("or_else", []))) or None,
+                ", ".join(map(words, a.get("indistinguishable_from", []))) or None,
                 ", ".join(map(words, a.get("confusable_with", []))),
             ]
             for a in accepted
@@ -204,39 +205,39 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
     page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
 
 
-def _unexplained(page: Page, left: Mapping[str, Any], gap: Mapping[str, Any] | None) -> None:
+def _unexplained(page: Page, left: Mapping[str, Any], force: Mapping[str, Any] | None) -> None:
     page.subheading("What stays unexplained")
     page.table(
         ["quantity", "value", "unit"],
         [
             ["residual over all frames, RMS", _number(left["rmse_mm"]), "mm"],
             ["noise floor", _number(left["noise_floor_mm"]), "mm"],
-            ["worst frame", _number(left["worst_frame"]), ""],
-            ["residual there, RMS", _number(left["worst_frame_rmse_mm"]), "mm"],
-            ["middle of the worst tenth of the body, at frame 0", left["worst_place_at_frame_0_m"], "m"],
+            ["worst time", _number(left["worst_time_s"]), "s"],
+            ["residual there, RMS", _number(left["worst_instant_rmse_mm"]), "mm"],
+            ["middle of the worst tenth of the body, at frame 0", left["worst_place_at_start_m"], "m"],
             ["residual of that tenth, RMS", _number(left["worst_place_rmse_mm"]), "mm"],
         ],
     )
-    if gap is not None:
-        errors = f"{number(_number(gap['fit_rmse_mm']))} mm"
-        if gap["held_out_rmse_mm"] is not None:
-            errors += f", {number(_number(gap['held_out_rmse_mm']))} mm held out"
+    if force is not None:
+        errors = f"{number(_number(force['fit_rmse_mm']))} mm"
+        if force["held_out_rmse_mm"] is not None:
+            errors += f", {number(_number(force['held_out_rmse_mm']))} mm held out"
         page.note(
-            "Stop-gap, not an explanation: a force that changes smoothly in time and space, without a known cause, "
-            f"leaves {errors}. The twin has it as smooth force, to be used meanwhile; it holds for this throw alone."
+            "A force that changes smoothly in time and space and stands in for the discrepancy, without a known cause, "
+            f"leaves {errors}. The twin has it as smooth force, to be used meanwhile; it holds for this motion alone."
         )
 
 
-def _next_throw(page: Page, proposal: Mapping[str, Any] | None) -> None:
+def _next_experiment(page: Page, proposal: Mapping[str, Any] | None) -> None:
     if proposal is None:
         return
-    page.subheading("The throw to film next")
-    velocity, spin = proposal["velocity"], proposal["omega"]
+    page.subheading("The initial state to film next")
+    velocity, spin = proposal["initial_velocity"], proposal["initial_omega"]
     page.note(
-        f"{' and '.join(map(words, proposal['tells_apart']))} look alike in this throw "
-        f"({number(_number(proposal['difference_in_this_throw_mm']))} mm apart). Thrown at {number(velocity['value'])} "
-        f"{velocity['unit']} with a spin of {number(spin['value'])} {spin['unit']}, they would be "
-        f"{number(_number(proposal['predicted_difference_mm']))} mm apart."
+        f"{' and '.join(map(words, proposal['distinguishes']))} look alike in this motion "
+        f"({number(_number(proposal['present_difference_mm']))} mm apart). With an initial velocity of "
+        f"{number(velocity['value'])} {velocity['unit']} and a spin of {number(spin['value'])} {spin['unit']} they "
+        f"would be {number(_number(proposal['predicted_difference_mm']))} mm apart."
     )
 
 

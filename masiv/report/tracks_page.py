@@ -12,7 +12,7 @@ import numpy as np
 from masiv.refine.answer import answer
 from masiv.report.page import Page, Share
 from masiv.tracks.tracks import Tracks
-from masiv.tracks.twin import TracksTwin
+from masiv.twin import Twin
 
 COLUMNS = 2
 
@@ -20,7 +20,7 @@ COLUMNS = 2
 def write_page(
     path: Path,
     tracks: Tracks,
-    twin: TracksTwin,
+    twin: Twin,
     runs: list[dict[str, Any]],
     curves: Mapping[str, Mapping[str, np.ndarray]],
     refined: Sequence[Mapping[str, Any]],
@@ -34,15 +34,15 @@ def write_page(
     names = [n for n in runs[0] if n not in ("run", "use")] if runs else []
     page.table(["run", "use", *names], [[r["run"], r["use"], *(r[n] for n in names)] for r in runs])
     page.heading("The twin")
-    rows: list[list[Any]] = [["law", twin.law, "", None]]
-    rows += [[n.replace("_", " "), v, u, e] for n, (v, u, e) in twin.parameters.items()]
+    rows: list[list[Any]] = [["law", "rigid" if twin.rigid else twin.law.kind, "", None]]
+    if not twin.rigid:
+        described = twin.law.description()["parameters"]
+        rows += [[n.replace("_", " "), row["value"], row["unit"], row.get("stderr")] for n, row in described.items()]
     for effect in twin.effects:
         where = ", ".join(effect.bodies) or "all"
-        rows += [
-            [f"{effect.effect.replace('_', ' ')} ({where}): {n}", v, u, e] for n, (v, u, e) in effect.parameters.items()
-        ]
+        rows += [[f"{effect.name.replace('_', ' ')} ({where}): {n}", v, u, e] for n, v, u, e in effect.rows()]
         if effect.place is not None:
-            rows.append([f"{effect.effect.replace('_', ' ')}: place in the body", list(effect.place), "m", None])
+            rows.append([f"{effect.name.replace('_', ' ')}: place in the body", list(effect.place), "m", None])
     page.table(["quantity", "value", "unit", "standard error"], rows)
     for document in refined:
         _section(page, document)

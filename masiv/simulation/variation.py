@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +16,7 @@ from masiv.errors import InputError
 from masiv.mpm.design import grid_spacing
 from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame
-
-if TYPE_CHECKING:
-    from masiv.twin import Twin, TwinEffect
+from masiv.twin import Twin, TwinEffect
 
 
 def without_effects(twin: Twin, names: tuple[str, ...]) -> Twin:
@@ -35,7 +32,7 @@ def with_density(twin: Twin, density: float) -> Twin:
     """``twin`` with another density [kg/m^3]; its moduli stay. Raises InputError."""
     if not (math.isfinite(density) and density > 0):
         raise InputError(f"--density {density:g}: give a density above 0 kg/m³")
-    return replace(twin, density=float(density))
+    return twin.with_body(density=float(density))
 
 
 def with_ground(twin: Twin, ground: str) -> Twin:
@@ -48,7 +45,8 @@ def with_ground(twin: Twin, ground: str) -> Twin:
     before = 0.0 if twin.ground is None else twin.ground.height
     if ground.strip().lower() == "none":
         # The normal stays the vertical of the simulation, in whose axes effects are.
-        return replace(twin, ground=None, contact="none", up=normal, effects=_over_new_ground(twin.effects, before))
+        changed = replace(twin, up=normal, effects=_over_new_ground(twin.effects, before))
+        return changed.with_boundary(ground=None, contact="none")
     try:
         height = float(ground)
     except ValueError:
@@ -60,7 +58,7 @@ def with_ground(twin: Twin, ground: str) -> Twin:
         raise InputError(f"--ground {ground}: the body reaches down to {lowest:.3g} m, give a lower ground")
     contact = "sticky" if twin.contact == "none" else twin.contact
     effects = _over_new_ground(twin.effects, before - height)
-    return replace(twin, ground=Ground(normal, height), contact=contact, effects=effects)
+    return replace(twin, effects=effects).with_boundary(ground=Ground(normal, height), contact=contact)
 
 
 def with_body_of(twin: Twin, other: Twin) -> tuple[Twin, np.ndarray]:
@@ -70,7 +68,7 @@ def with_body_of(twin: Twin, other: Twin) -> tuple[Twin, np.ndarray]:
     """
     shift = _place(twin, other.positions.astype(np.float64))
     positions = (other.positions + shift).astype(np.float32)
-    return replace(twin, positions=positions, volume=other.volume), shift
+    return twin.with_body(particles=positions, volume=other.volume), shift
 
 
 def with_mesh(twin: Twin, mesh: Path) -> Twin:
@@ -88,7 +86,7 @@ def with_mesh(twin: Twin, mesh: Path) -> Twin:
         raise InputError(f"{mesh} is too thin to be filled with about {len(twin.positions)} particles")
     particles = axes.points_to_world(body.particles)
     particles = particles + _place(twin, particles)
-    return replace(twin, positions=particles.astype(np.float32), volume=float(body.volume))
+    return twin.with_body(particles=particles.astype(np.float32), volume=float(body.volume))
 
 
 def _up(twin: Twin) -> np.ndarray:

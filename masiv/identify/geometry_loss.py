@@ -41,3 +41,8 @@ def surface_points(points: np.ndarray) -> np.ndarray:
     distance, index = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
     offset = points[index[:, 1:]].mean(axis=1) - points
     return np.linalg.norm(offset, axis=1) > ONE_SIDED * distance[:, 1:].mean(axis=1)
+
+
+def mean_distance(field: np.ndarray) -> float:
+    """Mean distance [m] of a residual field (K, N, 3)."""
+    return float(np.linalg.norm(field, axis=2).mean())
