@@ -109,7 +109,7 @@ def baseline_fits(case, config):
         "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
     )
     simulation = FreeBodyModel([setup])
-    problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.frames))
+    problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.problem.frames))
     fits = baselines(simulation, problem, config, Checkpoint(None), quiet, Workers())
     return simulation, setup.observation, fits
 

@@ -45,12 +45,12 @@ def identify(
         typer.Option(
             "--geometry-loss",
             help="What a neural law is fitted to: trajectory (paths of particles, then surfaces; paths alone with "
-            "identify.polish: false), continuum (bodies frame by frame), surface, or none (pictures alone). "
+            "identify.surface_finetune: false), continuum (bodies frame by frame), surface, or none (pictures alone). "
             "[default: trajectory]",
         ),
     ] = None,
     no_silhouette: Annotated[
-        bool, typer.Option("--no-silhouette", help="Fit a neural law without silhouettes and paint: to geometry alone.")
+        bool, typer.Option("--no-silhouette", help="Fit a neural law to geometry alone, without the pictures.")
     ] = False,
     fit_frames: FitFramesOption = None,
     holdout: HoldoutOption = None,

@@ -49,3 +49,19 @@ class Checkpoint:
         """Forget the state: the stage is done."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
+
+
+class NestedCheckpoint(Checkpoint):
+    """``parent`` for a part of its stage: every state that is saved also holds ``fixed``, the results of earlier parts.
+
+    ``load`` gives the whole state. A key of a saved state takes the place of the same key in ``fixed``.
+    """
+
+    def __init__(self, parent: Checkpoint, fixed: dict[str, Any]) -> None:
+        super().__init__(parent.path, parent.every_s)
+        self._parent = parent
+        self._fixed = fixed
+
+    def save(self, state: dict[str, Any]) -> None:
+        self._parent.save({**self._fixed, **state})
+        self._last = time.monotonic()

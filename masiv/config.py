@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import InputError
-from masiv.identify.config import IdentifyConfig
+from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
@@ -21,6 +21,18 @@ from masiv.tracks.config import TracksConfig
 
 Preset = Literal["quick", "standard", "paper"]
 DEFAULT_PRESET = "standard"
+
+RENAMED_KEYS = {
+    "identify": {
+        "polish": "surface_finetune",
+        "polish_silhouette_weight": "finetune_silhouette_weight",
+        "paint_weight": "color_weight",
+        "polish_paint_weight": "finetune_color_weight",
+    },
+}
+"""Keys of older versions and their names today, by section."""
+RENAMED_VALUES = {"identify": {"start": RENAMED_STARTS}}
+"""Values of older versions and their names today, by section and key."""
 
 
 class Config(BaseModel):
@@ -70,6 +82,18 @@ def load_config(
                 nested = {section: nested}
             merged = _merged(merged, nested)
     return validated(Config, merged, "the command line" if path is None else str(path))
+
+
+def with_current_names(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of an existing run, with the keys and values of older versions renamed."""
+    result = dict(config)
+    for section in {*RENAMED_KEYS, *RENAMED_VALUES} & result.keys():
+        keys, values = RENAMED_KEYS.get(section, {}), RENAMED_VALUES.get(section, {})
+        renamed = {keys.get(key, key): value for key, value in result[section].items()}
+        result[section] = {
+            key: values[key].get(value, value) if key in values else value for key, value in renamed.items()
+        }
+    return result
 
 
 def preset_overlay(name: str) -> dict[str, Any]:

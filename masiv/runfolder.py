@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from masiv.checkpoint import Checkpoint
+from masiv.config import with_current_names
 from masiv.errors import InputError
 from masiv.files import write_yaml
 from masiv.strict import read_yaml
@@ -64,7 +65,7 @@ class RunFolder:
             raise InputError(
                 f"{path / 'run.yaml'} was not written by this version of masiv: start a new run with --out"
             )
-        return cls(path, record)
+        return cls(path, {**record, "config": with_current_names(record["config"])})
 
     @classmethod
     def create_or_resume(cls, path: Path, request: Request) -> RunFolder:

@@ -1,4 +1,4 @@
-"""A ball that stands in the air, filled evenly with particles, as a problem of identify."""
+"""A ball that stands in the air, filled evenly with particles, as the image terms of a fit compare it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from ring_scene import ring, spheres_scene
 from test_identify import Seen
 
 from masiv.continuum.fill import DensityField, even_points
-from masiv.identify.config import IdentifyConfig
-from masiv.identify.problem import Problem
+from masiv.identify.losses.images import ImageTerms
+from masiv.models.filmed_body import FilmedBody
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Scene
 
@@ -20,7 +20,8 @@ def ball_scene() -> Scene:
     return spheres_scene(lambda frame: [(CENTRE, RADIUS)], frame_count=FRAMES, cameras=cameras)
 
 
-def ball_problem(scene: Scene, spacing: float) -> Problem:
+def ball_terms(scene: Scene, spacing: float) -> ImageTerms:
+    """Particles of ``spacing`` [m]."""
     step = 0.01
     axis = np.arange(-0.3, 0.3 + step, step)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
@@ -28,4 +29,4 @@ def ball_problem(scene: Scene, spacing: float) -> Problem:
     points = even_points(DensityField(inside, CENTRE - 0.3, step), spacing)
     still = np.repeat(points[None], FRAMES, axis=0).astype(np.float32)
     seen = Seen(still, np.arange(FRAMES) / scene.fps, len(points) * spacing**3)
-    return Problem(scene, seen, IdentifyConfig(), SimulatorConfig())
+    return ImageTerms(FilmedBody(scene, seen, SimulatorConfig(), samples=2), with_colors=True)

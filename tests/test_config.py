@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from masiv.config import Config, load_config, preset_overlay
+from masiv.config import Config, load_config, preset_overlay, with_current_names
 from masiv.errors import InputError
 
 
@@ -51,6 +51,25 @@ def test_a_run_is_the_base_unless_a_preset_is_asked_for(tmp_path):
     again = load_config("quick", base=base)
     assert again.seed == 9
     assert again.trajectory == load_config("quick").trajectory
+
+
+def test_keys_and_values_of_older_versions_have_new_names():
+    old = {
+        "seed": 3,
+        "identify": {"polish": False, "polish_silhouette_weight": 2.0, "polish_paint_weight": 0.5, "paint_weight": 0.2,
+                     "start": "honey", "contact": "slip"},
+    }  # fmt: skip
+    new = with_current_names(old)
+    assert new["seed"] == 3
+    assert new["identify"] == {
+        "surface_finetune": False, "finetune_silhouette_weight": 2.0, "finetune_color_weight": 0.5, "color_weight": 0.2,
+        "start": "maxwell_fluid", "contact": "slip",
+    }  # fmt: skip
+    identify = load_config(base=new).identify
+    assert (identify.surface_finetune, identify.start, identify.color_weight) == (False, "maxwell_fluid", 0.2)
+    assert old["identify"]["start"] == "honey"
+    current = load_config().model_dump(mode="json")
+    assert with_current_names(current) == current
 
 
 @pytest.mark.parametrize(

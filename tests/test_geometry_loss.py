@@ -5,7 +5,7 @@ import pytest
 import torch
 from test_identify import body, scene, seen, settings  # noqa: F401  (fixtures)
 
-from masiv.identify.geometry_loss import chamfer_error, surface_points, trajectory_error
+from masiv.identify.losses.geometry import chamfer_error, surface_points, trajectory_error
 from masiv.identify.stage import identify
 from masiv.mpm.config import SimulatorConfig
 

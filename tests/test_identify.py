@@ -1,4 +1,4 @@
-"""Launch, start and joint fit on trajectories simulated with a known law."""
+"""Initial motion, starting law and joint fit on trajectories simulated with a known law."""
 
 from pathlib import Path
 
@@ -10,17 +10,24 @@ from scipy.spatial.transform import Rotation
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.problem import Problem
+from masiv.identify.losses.objective import Objective
+from masiv.identify.neural.starting_law import (
+    DIVERGED,
+    MAX_START_MODULUS,
+    StartingLaw,
+    objective_of_start,
+    rank_starting_laws,
+)
 from masiv.identify.stage import identify
-from masiv.identify.start import DIVERGED, STIFFEST, Start, _error, best_first
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.models.initial_state import InitialState, estimate_initial_motion
+from masiv.models.filmed_body import FilmedBody
 from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.simulate import simulate
-from masiv.simulation.subdivide import merge_subparticles
+from masiv.simulation.subdivide import wholes
 from masiv.twin import Twin
 
 GRAVITY = np.array([0.0, -9.8, 0.0])
@@ -72,7 +79,7 @@ def seen(taichi, body):
     return Seen(motion.positions[:FRAMES], motion.times[:FRAMES], 0.064), motion.positions
 
 
-def test_launch_of_a_rigid_throw(body):
+def test_initial_motion_of_a_rigid_body(body):
     times = np.arange(6) / FPS
     centre = body.mean(0)
     path = np.stack([
@@ -107,19 +114,23 @@ def settings(**changes):
     return IdentifyConfig(**(fast | changes))
 
 
-def test_a_law_that_flows_must_be_plainly_nearer():
-    """A yield that the motion does not reach is invented: few particles do not tell 5 %."""
+def test_an_inelastic_starting_law_must_be_nearer_by_a_margin():
+    """A yield stress that the motion does not reach cannot be identified; few particles do not show 5 %."""
     law = load_law(pretrained_path("jelly"))
-    starts = {name: Start(name, "sticky", law, error) for name, error in (("plasticine", 17.4), ("jelly", 18.2))}
-    assert [s.material for s in best_first(list(starts.values()))] == ["jelly", "plasticine"]
-    nearer = [Start("plasticine", "sticky", law, 15.0), starts["jelly"], Start("water", "sticky", law, 14.0)]
-    assert [s.material for s in best_first(nearer)] == ["water", "plasticine", "jelly"]
+    starts = {name: StartingLaw(name, "sticky", law, error) for name, error in (("plasticine", 17.4), ("jelly", 18.2))}
+    assert [s.material for s in rank_starting_laws(list(starts.values()))] == ["jelly", "plasticine"]
+    nearer = [
+        StartingLaw("plasticine", "sticky", law, 15.0),
+        starts["jelly"],
+        StartingLaw("water", "sticky", law, 14.0),
+    ]
+    assert [s.material for s in rank_starting_laws(nearer)] == ["water", "plasticine", "jelly"]
 
 
 def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
     trajectory, positions = seen
     twin = identify(scene(), trajectory, settings(), SimulatorConfig())
-    predicted = merge_subparticles(simulate(twin, frames=FRAMES + 4).positions, positions.shape[1])
+    predicted = wholes(simulate(twin, frames=FRAMES + 4).positions, positions.shape[1])
     error = np.linalg.norm(predicted - positions, axis=2).mean(1)
     rigid = np.linalg.norm(positions[-1] - positions[0] - (positions[-1] - positions[0]).mean(0), axis=1).mean()
     assert twin.fit["trajectory_error_mm"] < 8
@@ -127,12 +138,15 @@ def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
     np.testing.assert_allclose(twin.velocity, VELOCITY, atol=0.1)
 
 
-def test_no_start_is_stiffer_than_a_motion_could_tell(seen):
-    problem = Problem(
-        scene(), seen[0], settings(), SimulatorConfig(), chosen=np.arange(0, len(seen[0].positions[0]), 4)
+def test_no_starting_law_is_stiffer_than_a_motion_determines(seen):
+    problem = FilmedBody(
+        scene(), seen[0], SimulatorConfig(), samples=2, chosen=np.arange(0, len(seen[0].positions[0]), 4)
     )
     motion = InitialState.of_world(problem.axes, VELOCITY, OMEGA)
-    errors = [_error(problem, motion, "jelly", "sticky", share * STIFFEST) for share in (0.5, 1.01)]
+    errors = [
+        objective_of_start(Objective(problem, settings()), motion, "jelly", "sticky", factor * MAX_START_MODULUS)
+        for factor in (0.5, 1.01)
+    ]
     assert errors[0] < DIVERGED  # it could be simulated, and so could the stiffer one
     assert errors[1] == DIVERGED
 

@@ -8,8 +8,9 @@ import pytest
 from test_identify import FPS, FRAMES, GRAVITY, GROUND, OMEGA, UP, VELOCITY, Seen, scene
 
 from masiv.checkpoint import Checkpoint
-from masiv.identify import baseline
-from masiv.identify.classical_fit import FamilyFit, ranked
+from masiv.identify.classical import shortlist
+from masiv.identify.classical.fit import FamilyFit
+from masiv.identify.classical.model_selection import rank_by_bic
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.stage import identify
 from masiv.inference.noise_model import effective_samples
@@ -102,7 +103,7 @@ def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(body, tmp_path):
 @pytest.mark.usefixtures("taichi")
 def test_auto_names_the_family_that_moved_so(body, monkeypatch):
     coarse = {kind: dataclasses.replace(FAMILIES[kind], search={}) for kind in ("newtonian", "neo_hookean")}
-    monkeypatch.setattr(baseline, "FAMILIES", coarse)
+    monkeypatch.setattr(shortlist, "FAMILIES", coarse)
     seen = filmed(body, ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3))
     twin = identify(scene(), seen, settings("auto", family_rollouts=24), SimulatorConfig())
     assert twin.fit["law"] == twin.law.kind == "neo_hookean"
@@ -117,8 +118,8 @@ def test_ranking_prefers_fewer_parameters_unless_more_explain_more():
         values = {str(k): 0.0 for k in range(parameters)}
         return FamilyFit(kind, "sticky", values, mean_square=rms**2, samples=100)
 
-    assert [f.kind for f in ranked([fit("b", 10, 0.0099), fit("a", 9, 0.01)])] == ["a", "b"]
-    assert [f.kind for f in ranked([fit("a", 9, 0.01), fit("b", 10, 0.005)])] == ["b", "a"]
+    assert [f.kind for f in rank_by_bic([fit("b", 10, 0.0099), fit("a", 9, 0.01)])] == ["a", "b"]
+    assert [f.kind for f in rank_by_bic([fit("a", 9, 0.01), fit("b", 10, 0.005)])] == ["b", "a"]
 
 
 @pytest.mark.parametrize("kind", list(FAMILIES))

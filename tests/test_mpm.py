@@ -8,7 +8,7 @@ import torch
 
 from masiv.effects.active import ActiveEffects, BoundEffects
 from masiv.errors import NonFiniteError
-from masiv.identify.start import with_scales
+from masiv.identify.neural.starting_law import with_scales
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw

@@ -16,10 +16,11 @@ from test_refine import FITTED, OMEGA, VELOCITY, observed, scene
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
-from masiv.identify.classical_fit import FamilyFit
+from masiv.identify.classical.fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.problem import Problem
-from masiv.identify.start import _effort, choose_start
+from masiv.identify.losses.objective import Objective
+from masiv.identify.neural.starting_law import choose_starting_laws, search_cost
 from masiv.models.base import Model
 from masiv.models.families import FAMILIES
 from masiv.models.free_body import FreeBodyModel
@@ -139,20 +140,21 @@ def test_as_many_as_asked_or_as_there_are_cores():
 
 
 def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
-    monkeypatch.setattr("masiv.identify.start.MODULI", (1e4, 3e4))
-    monkeypatch.setattr("masiv.identify.start.REFINED", 2)
+    monkeypatch.setattr("masiv.identify.neural.starting_law.START_MODULI", (1e4, 3e4))
+    monkeypatch.setattr("masiv.identify.neural.starting_law.SEARCHED_MATERIALS", 2)
     motion = observed({})
     motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
-    problem = Problem(scene(), motion, config, SimulatorConfig(), chosen=np.arange(0, 512, 4))
+    problem = FilmedBody(scene(), motion, SimulatorConfig(), chosen=np.arange(0, 512, 4))
+    objective = Objective(problem, config)
     throw = InitialState.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
     listening = Listening()
-    alone, beside = (choose_start(problem, throw, quiet, workers) for workers in (listening, two))
+    alone, beside = (choose_starting_laws(objective, throw, quiet, workers) for workers in (listening, two))
     assert len(alone) == 2
-    efforts = [_effort(name, modulus) for _, _, name, _, _, modulus in listening.heard[1]]
+    efforts = [search_cost(name, modulus) for _, _, name, _, _, modulus in listening.heard[1]]
     assert efforts == sorted(efforts, reverse=True)  # or the longest search may begin last, alone
     for a, b in zip(alone, beside, strict=True):
-        assert (a.material, a.contact, a.error) == (b.material, b.contact, b.error)
+        assert (a.material, a.contact, a.objective) == (b.material, b.contact, b.objective)
         for name, value in a.law.state_dict().items():
             assert torch.equal(value, b.law.state_dict()[name])
 

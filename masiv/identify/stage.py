@@ -1,9 +1,12 @@
-"""The identify stage: trajectory -> launch -> start -> joint fit -> twin."""
+"""The identify stage: from a trajectory to a twin.
+
+MASIV, section "Material-Agnostic System Identification": the initial velocity from free flight, a starting law, then a
+joint fit of law, velocity, spin and effective ground through the rollout.
+"""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,17 +14,20 @@ import numpy as np
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.trajectory import Trajectory
-from masiv.identify.baseline import identify_classical
+from masiv.identify.adapter import fit_adapter
+from masiv.identify.classical.identify import fit_classical_law
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.learn import learn
-from masiv.identify.problem import Problem
-from masiv.identify.throw import Throw, throw_of
+from masiv.identify.losses.objective import Objective
+from masiv.identify.neural.multi_start import fit_neural_law
+from masiv.identify.recording import FitRecording, prepare_recording
+from masiv.identify.result import IdentificationResult
 from masiv.models.initial_state import InitialState
+from masiv.models.filmed_body import FilmedBody
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
-from masiv.simulation.twin_effects import effect_members
 from masiv.subsample import random_subset
+from masiv.simulation.twin_effects import effect_members
 from masiv.twin import Twin
 
 
@@ -36,63 +42,47 @@ def identify(
     checkpoint: Checkpoint | None = None,
     progress: Progress = silent,
 ) -> Twin:
-    """The twin of what ``trajectory`` (over the frames of ``scene``) shows. Raises MasivError where no law explains it.
+    """The twin whose rollout follows ``trajectory``, the observed motion over the frames of ``scene``.
 
-    With ``config.law`` neural nothing is assumed of the material: the pretrained law whose rollout is nearest to the
-    motion is only the start. Otherwise the law is a classical one, or an adapter on one. others: more throws of the
-    same object, from which a neural law is learnt, too; raises InputError for any other law.
+    A neural law (``config.law``) assumes nothing of the material: the pretrained law whose rollout is nearest to the
+    motion is only its start. Any other law is a classical one, or an adapter on one. others: more recordings of the
+    same object; a neural law is fitted to all of them.
 
-    Where ``config.processes`` lets several processes look for that start, ``scene`` must be picklable, and a script
-    needs ``if __name__ == "__main__":`` around what it does.
+    If ``config.processes`` allows several processes, ``scene`` must be picklable, and a script needs
+    ``if __name__ == "__main__":`` around its calls. Raises InputError for ``others`` with a law that is not neural, and
+    MasivError if no law explains the motion.
     """
     if others:
-        config.refuse_more_throws()
+        config.require_neural_for_several()
+    checkpoint = checkpoint or Checkpoint(None)
     with runtime.torch_threads(1):
-        seen = [(scene, trajectory), *others]
-        return _identify(seen, config, simulator, seed, checkpoint or Checkpoint(None), progress)
-
-
-def _identify(
-    seen: Sequence[tuple[Scene, Trajectory]],
-    config: IdentifyConfig,
-    simulator: SimulatorConfig,
-    seed: int,
-    checkpoint: Checkpoint,
-    progress: Progress,
-) -> Twin:
-    scene, trajectory = seen[0]
-    throws, initial_motions = zip(*(throw_of(*one, config, simulator) for one in seen), strict=True)
-    first, initial_motion, axes = throws[0], initial_motions[0], throws[0].problem.axes
-    chosen = random_subset(trajectory.positions.shape[1], config.search_particles, seed)
-    coarse = functools.partial(Problem, scene, trajectory, config, simulator, chosen=chosen)
-    if config.law == "neural":
-        found = learn(throws, coarse, seed, checkpoint, progress)
-    else:
-        found = identify_classical(
-            first.problem, coarse(), first.motion, first.first_frames, seed, checkpoint, progress
-        )  # fmt: skip
+        prepared = [prepare_recording(*one, config, simulator) for one in ((scene, trajectory), *others)]
+        recordings = [recording for recording, _ in prepared]
+        result = _fit(recordings, _coarse(scene, trajectory, recordings[0], seed), seed, checkpoint, progress)
+    initial_motion = prepared[0][1]
+    axes, initial_state = recordings[0].objective.problem.axes, result.initial_state
     return Twin.of_body(
         observation=scene.path.resolve().name,
         positions=np.asarray(trajectory.positions[0], dtype=np.float32),
-        velocity=axes.vectors_to_world(found.motion.velocity.double().numpy()),
-        omega=axes.vectors_to_world(found.motion.omega.double().numpy()),
+        velocity=axes.vectors_to_world(initial_state.velocity.double().numpy()),
+        omega=axes.vectors_to_world(initial_state.omega.double().numpy()),
         gravity=np.asarray(scene.gravity, dtype=np.float64),
-        ground=found.motion.ground(scene.ground),
-        contact=found.contact,
+        ground=initial_state.ground(scene.ground),
+        contact=result.contact,
         volume=trajectory.volume,
         density=scene.density,
         up=np.asarray(scene.up, dtype=np.float64),
         fps=scene.fps,
-        law=found.law,
+        law=result.law,
         simulator=simulator,
         fit={
-            **found.report,
-            "trajectory_error_mm": 1e3 * found.error_m,
-            "launch_velocity_m_per_s": [float(v) for v in initial_motion.velocity],
-            "launch_omega_rad_per_s": [float(v) for v in initial_motion.omega],
-            "launch_last_frame": initial_motion.last_frame,
+            **result.report,
+            "trajectory_error_mm": 1e3 * result.trajectory_error,
+            "initial_velocity_m_per_s": [float(v) for v in initial_motion.velocity],
+            "initial_omega_rad_per_s": [float(v) for v in initial_motion.omega],
+            "free_flight_last_frame": initial_motion.last_frame,
             "frames": scene.frame_count,
-            "history": found.history,
+            "history": result.history,
         },
     )
 
@@ -107,21 +97,56 @@ def relearn(
     checkpoint: Checkpoint | None = None,
     progress: Progress = silent,
 ) -> Twin:
-    """``twin`` with a neural law that is learnt beside its effects, which stay as they are, from its throw on.
+    """``twin`` with a neural law, fitted to ``trajectory`` with the twin's effects, which do not change.
 
-    Raises MasivError where no law explains ``trajectory``.
+    The fit starts with the initial state of ``twin``. Raises MasivError if no law explains the motion.
     """
-    made = functools.partial(Problem, scene, trajectory, config, twin.simulator, known=effect_members(twin, twin.body))
-    chosen = random_subset(trajectory.positions.shape[1], config.search_particles, seed)
-    problem, coarse = made(), functools.partial(made, chosen=chosen)
+    known = effect_members(twin, twin.body)
+    problem = FilmedBody(scene, trajectory, twin.simulator, samples=config.samples_per_frame, known=known)
     axes = problem.axes
-    raised = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
-    motion = InitialState.of_world(axes, twin.velocity, twin.omega, raised)
+    ground_offset = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
+    initial_state = InitialState.of_world(axes, twin.velocity, twin.omega, ground_offset)
+    recording = FitRecording(Objective.of(problem, trajectory, config), initial_state, (problem.frames + 1) // 2)
+    coarse = _coarse(scene, trajectory, recording, seed)
     with runtime.torch_threads(1):
-        throw = Throw(problem, motion, (problem.frames + 1) // 2)
-        found = learn([throw], coarse, seed, checkpoint or Checkpoint(None), progress)
-    velocity, omega = (axes.vectors_to_world(v.double().numpy()) for v in (found.motion.velocity, found.motion.omega))
-    learned = twin.with_body(law=found.law).with_motion(velocity=velocity, omega=omega)
-    learned = learned.with_boundary(ground=found.motion.ground(scene.ground), contact=found.contact)
-    errors = {"trajectory_error_mm": 1e3 * found.error_m, "history": found.history}
-    return replace(learned, fit={**twin.fit, **found.report, **errors})
+        result = fit_neural_law([recording], coarse, seed, checkpoint or Checkpoint(None), progress)
+    state = result.initial_state
+    velocity, omega = (axes.vectors_to_world(v.double().numpy()) for v in (state.velocity, state.omega))
+    learned = twin.with_body(law=result.law).with_motion(velocity=velocity, omega=omega)
+    learned = learned.with_boundary(ground=state.ground(scene.ground), contact=result.contact)
+    errors = {"trajectory_error_mm": 1e3 * result.trajectory_error, "history": result.history}
+    return replace(learned, fit={**twin.fit, **result.report, **errors})
+
+
+def _coarse(
+    scene: Scene, trajectory: Trajectory, recording: FitRecording, seed: int
+) -> Callable[[], Objective]:
+    """Makes the objective of ``recording`` with few particles, and the same known effects."""
+    config, whole = recording.objective.config, recording.objective.problem
+
+    def make() -> Objective:
+        chosen = random_subset(trajectory.positions.shape[1], config.search_particles, seed)
+        problem = FilmedBody(
+            scene, trajectory, whole.body.config, samples=config.samples_per_frame, chosen=chosen, known=whole.known
+        )
+        return Objective.of(problem, trajectory, config)
+
+    return make
+
+
+def _fit(
+    recordings: Sequence[FitRecording],
+    coarse: Callable[[], Objective],
+    seed: int,
+    checkpoint: Checkpoint,
+    progress: Progress,
+) -> IdentificationResult:
+    """The law of the kind that the configuration asks for."""
+    config = recordings[0].objective.config
+    if config.law == "neural":
+        return fit_neural_law(recordings, coarse, seed, checkpoint, progress)
+    kind = config.adapter_base if config.law == "adapter" else config.law
+    fit, report = fit_classical_law(kind, recordings[0], coarse(), checkpoint, progress)
+    if config.law == "adapter":
+        return fit_adapter(fit, recordings[0], report, seed, checkpoint, progress)
+    return IdentificationResult(fit.law, fit.initial_state, fit.contact, fit.error_m, report)

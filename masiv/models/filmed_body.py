@@ -27,8 +27,8 @@ class FilmedBody:
     """Particles of an observed motion, simulated at ``samples`` instants a frame.
 
     body: the particles at frame 0, float32, simulation axes. targets (F * samples, N, 3) [m, simulation axes]: where
-    they were observed at these instants, the start left out. known: effects that act in every rollout that is given
-    none.
+    they were observed at these instants, the start left out. known: effects, with their parameters (P,), that act in
+    every rollout that is given none.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class FilmedBody:
         chosen: np.ndarray | None = None,
         known: Sequence[tuple[Effect, torch.Tensor]] = (),
     ) -> None:
-        """chosen (N,): which particles of the motion are simulated; None: all. known: with their parameters (P,)."""
+        """chosen (N,): which particles of the motion are simulated; None: all."""
         self.scene = scene
         self.samples = samples
         self.frames = len(motion.times) - 1
@@ -62,7 +62,7 @@ class FilmedBody:
             config=simulator,
             speed=float((span[1:] - span[:-1]).norm(dim=2).max()) * samples * scene.fps,
         )
-        self.known = self.body.effects(known, self.context()) if known else None
+        self.known = tuple(known)
 
     def with_first_targets(self, other: FilmedBody) -> FilmedBody:
         """A copy that starts where ``other``, with the same particles, does, and has its targets as far as they go."""
@@ -133,7 +133,8 @@ class FilmedBody:
         steps: substeps a frame, a multiple of ``samples``; as many as the law needs if None. effects: ``known`` if
         None. Raises NonFiniteError, and MasivError if the law needs too many substeps.
         """
-        effects = effects or self.known
+        if effects is None and self.known:
+            effects = self.body.effects(self.known, self.context())
         steps = steps or self.substeps(law)
         # The ground is the plane y = 0 of the simulation: to raise it, the body is lowered.
         raised = start.ground_offset + (effects.ground_shift() if effects else 0.0)

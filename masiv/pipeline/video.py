@@ -35,7 +35,7 @@ class VideoRun(Run):
         config = settings(overrides, existing.config if existing else None, **flags)
         read = read_scene(scene)
         for other in config.identify.also:
-            config.identify.refuse_more_throws()
+            config.identify.require_neural_for_several()
             if Path(other).resolve() == out.resolve():
                 raise InputError(f"--also {other} is the run itself: give runs of other recordings of the same object")
             RunFolder.open(Path(other)).require("trajectory")

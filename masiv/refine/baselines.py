@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.classical_fit import FamilyFit, fit_family, ranked
-from masiv.identify.problem import Problem
+from masiv.identify.classical.fit import FamilyFit, fit_family
+from masiv.identify.classical.model_selection import rank_by_bic
+from masiv.identify.losses.objective import Objective
 from masiv.inference.least_squares import linearize, with_start_values
 from masiv.inference.model_fit import ModelFit, evaluate_fit, gauss_newton_fit, residual_of
 from masiv.inference.robust import robust_scale_of
@@ -33,8 +34,8 @@ class BaselineProblem:
     """The fitted frames of the first observation. coarse: on the particles of the search; coarser: on fewer;
     first_frames: frames of the first fit, free flight and first contact."""
 
-    coarse: Problem
-    coarser: Problem
+    coarse: Objective
+    coarser: Objective
     first_frames: int
 
 
@@ -72,7 +73,7 @@ def _shortlist(
     motion = forward_model.setups[0].start
     tasks = [(kind, problem.coarser, motion, problem.first_frames, SHORT_BUDGET) for kind in kinds]
     short = list(_known(kinds, workers.map(_fit_family, tasks), progress))
-    return [f.kind for f in ranked(_some(short))[: config.families]]
+    return [f.kind for f in rank_by_bic(_some(short))[: config.families]]
 
 
 def _fitted(
@@ -91,8 +92,8 @@ def _fitted(
     return _some([saved[kind] for kind in kinds if kind in saved])
 
 
-def _fit_family(kind: str, problem: Problem, motion: InitialState, first_frames: int, budget: float) -> FamilyFit:
-    return fit_family(kind, problem, motion, first_frames, Checkpoint(None), silent, share=budget)
+def _fit_family(kind: str, objective: Objective, motion: InitialState, first_frames: int, budget: float) -> FamilyFit:
+    return fit_family(kind, objective, motion, first_frames, Checkpoint(None), silent, budget_factor=budget)
 
 
 def _known(kinds: Sequence[str], results: Iterable[FamilyFit | TaskError], progress: Progress) -> Iterator[FamilyFit]:

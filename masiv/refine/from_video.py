@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
-from masiv.identify.config import IdentifyConfig
+from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
 from masiv.models.free_body import FreeBodyModel
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import Observed, first_frames
@@ -31,8 +31,6 @@ COMPETITORS = {
     "sand": ("drucker_prager", "von_mises"),
 }
 """Classical laws that are worth a try, by the law whose rollout was nearest to the motion in identify."""
-FORMER_STARTS = {"honey": "maxwell_fluid"}
-"""Names of that law in run folders of earlier versions."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def refine_recordings(
     Raises InputError for an unknown effect in ``config.effects``, MasivError if no law explains the motion.
     """
     check_effects(config)
-    start = FORMER_STARTS.get(start or "", start)
+    start = RENAMED_STARTS.get(start or "", start)
     if not config.laws and start in COMPETITORS:
         config = config.model_copy(update={"laws": list(COMPETITORS[start])})
     with runtime.torch_threads(1), Workers(processes_wanted(config.processes)) as workers:
@@ -91,7 +89,7 @@ def refine_recordings(
         ]
         forward_model = FreeBodyModel([setup for setup, *_ in prepared])
         _, coarse, coarser, initial_motion = prepared[0]
-        problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.frames))
+        problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.problem.frames))
         fits = baselines(forward_model, problem, config, checkpoint or Checkpoint(None), progress, workers)
         settings = SearchSettings.of(config, rank_only=dry_run, workers=workers, progress=progress)
         result = refine(forward_model, fits, settings)

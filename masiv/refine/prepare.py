@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.problem import Problem
+from masiv.identify.losses.objective import Objective
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.free_body import FreeBodySetup
 from masiv.models.initial_state import InitialMotion, InitialState, estimate_initial_motion
@@ -40,20 +40,19 @@ def prepare(
     identify: IdentifyConfig,
     simulator: SimulatorConfig,
     config: RefineConfig,
-) -> tuple[FreeBodySetup, Problem, Problem, InitialMotion]:
-    """What ``FreeBodyModel`` needs of a recording; the problem of its fitted frames alone on the same particles, and
-    that on fewer; the estimate of the initial motion.
+) -> tuple[FreeBodySetup, Objective, Objective, InitialMotion]:
+    """What ``FreeBodyModel`` needs of a recording; objectives of its fitted frames alone, on the same particles and on
+    fewer; the estimate of the initial motion.
 
     fitted: the motion of the frames that may be fitted. whole: of all frames; only the later ones are taken from it.
     """
-    settings = identify.model_copy(update={"samples_per_frame": config.samples_per_frame})
     count, samples = fitted.positions.shape[1], config.samples_per_frame
     on_coarse, on_coarser = (
         thinned(simulator, min(n / count, 1.0)) for n in (config.particles, config.search_particles)
     )
     chosen, fewest = (kd_tree_subset(fitted.positions[0], n) for n in (config.particles, config.search_particles))
-    coarse = Problem(scene, fitted, settings, on_coarse, chosen=chosen)
-    coarser = Problem(scene, fitted, settings, on_coarser, chosen=fewest)
+    coarse = FilmedBody(scene, fitted, on_coarse, samples=samples, chosen=chosen)
+    coarser = FilmedBody(scene, fitted, on_coarser, samples=samples, chosen=fewest)
     finer = tuple(
         FilmedBody(scene, whole, finer_than(coarse, count, thinned(simulator, part)), samples=samples)
         for part in FINER_PARTICLES_PER_CELL
@@ -63,8 +62,8 @@ def prepare(
         fitted.positions, fitted.times, scene.gravity, scene.ground, clearance=coarse.spacing
     )
     noise = max(noise_floor(fitted.positions, motion.last_frame), MIN_NOISE)
-    paths = torch.cat([body.particles[None], body.targets]).double().numpy()
-    lost = config.tracking_error * beyond_rigid(paths) if scene.cameras else np.zeros(len(body.targets))
+    positions = torch.cat([body.particles[None], body.targets]).double().numpy()
+    lost = config.tracking_error * beyond_rigid(positions) if scene.cameras else np.zeros(len(body.targets))
     observation = VideoObservation(
         name=name,
         times=np.arange(1, len(body.targets) + 1) / (samples * scene.fps),
@@ -77,8 +76,10 @@ def prepare(
         simulation_axes=body.axes,
     )
     start = InitialState.of_world(coarse.axes, motion.velocity, motion.omega)
-    setup = FreeBodySetup(observation, body, finer, start, motion.last_frame, coarse.ground_range)
-    return setup, coarse, coarser, motion
+    paths = identify.model_copy(update={"samples_per_frame": samples})
+    objective = Objective(coarse, paths)
+    setup = FreeBodySetup(observation, body, finer, start, motion.last_frame, objective.ground_range)
+    return setup, objective, Objective(coarser, paths), motion
 
 
 def finer_than(coarse: FilmedBody, count: int, simulator: SimulatorConfig) -> SimulatorConfig:

@@ -200,8 +200,8 @@ def law_text(law: Mapping[str, Any], families: Sequence[Mapping[str, Any]]) -> s
         if "failed" in row:
             lines.append(f"         {row['law']}: failed, {row['failed']}")
             continue
-        pictures = row["picture_error"]
-        rank = f"BIC {row['bic_above_best']:.0f} above the best" if pictures is None else f"pictures {pictures:.3f}"
+        loss = row.get("image_loss", row.get("picture_error"))  # named otherwise in runs of older versions
+        rank = f"BIC {row['bic_above_best']:.0f} above the best" if loss is None else f"image loss {loss:.3f}"
         lines.append(f"         {row['law']}: {row['trajectory_error_mm']:.1f} mm from the paths, {rank}")
     return "\n".join(lines) + "\n"
 

@@ -63,7 +63,7 @@ def sample(folder: Path) -> Numbers:
     found["refine"] = refined(loaded(run / "refine.json"))
     found["after"] = {**twin_of_video(run), **metrics(run), **material(run), **motions(run)}
     found["after"]["held_out_trajectory"] = digest(run / "held_out/trajectory.npz", "positions")
-    masiv("simulate", run, "--frames", 5, "--velocity=1,2,0", "--without", "body_force", "--out", folder / "novel")
+    masiv("simulate", run, "--frames", 5, "--velocity=1,2,0", "--out", folder / "novel")
     found["simulate"] = digest(folder / "novel/rollout.npz", "positions")
     return found
 
@@ -78,7 +78,8 @@ def tracks_body(folder: Path) -> Numbers:
     masiv("refine", run, "--condition", "load", "--config", written(folder / "load.yaml", BAR_LOAD))
     found["refine_load"] = refined(loaded(run / "refine.load.json"))
     found["after"] = {**twin_of_tracks(run), "runs": run_errors(run)}
-    masiv("simulate", run, "--frames", 20, "--condition", "load", "--out", folder / "novel")
+    novel = "--condition", "load", "--without", "viscosity", "--out", folder / "novel"
+    masiv("simulate", run, "--frames", 20, *novel)
     found["simulate"] = {key: digest(folder / "novel/rollout.npz", key) for key in ("positions", "markers")}
     return found
 

@@ -1,4 +1,4 @@
-"""One law learnt from several throws of a body."""
+"""One law fitted to several recordings of a body."""
 
 import dataclasses
 
@@ -24,10 +24,10 @@ from test_identify import (  # noqa: F401  (fixtures)
 from masiv.checkpoint import Checkpoint
 from masiv.cli.main import run
 from masiv.errors import InputError
-from masiv.identify.descent import Descent
-from masiv.identify.fit import fit
+from masiv.identify.neural.training import train
+from masiv.identify.neural.training_state import TrainingState
+from masiv.identify.recording import prepare_recording
 from masiv.identify.stage import identify
-from masiv.identify.throw import throw_of
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.mpm.config import SimulatorConfig
@@ -36,12 +36,12 @@ from masiv.simulation.simulate import simulate
 from masiv.twin import Twin
 
 DROP = np.array([-0.3, -2.5, 0.1])
-"""A harder throw [m/s], which deforms the body more."""
+"""A faster release [m/s], which deforms the body more."""
 
 
 @pytest.fixture(scope="module")
 def dropped(taichi, body):  # noqa: F811
-    """Another throw of the body of ``seen``."""
+    """Another recording of the body of ``seen``."""
     truth = Twin.of_body(
         positions=body, velocity=DROP, omega=-OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
         volume=0.064, density=1000.0, up=UP, fps=FPS,
@@ -51,10 +51,10 @@ def dropped(taichi, body):  # noqa: F811
     return Seen(motion.positions, motion.times, 0.064)
 
 
-def throws(seen, dropped, config):  # noqa: F811
+def recordings_of(seen, dropped, config):  # noqa: F811
     shorter = dataclasses.replace(scene(), frame_count=FRAMES - 1)
     films = (scene(), seen[0]), (shorter, dropped)
-    return [throw_of(*film, config, SimulatorConfig())[0] for film in films]
+    return [prepare_recording(*film, config, SimulatorConfig())[0] for film in films]
 
 
 def stiffer(factor):
@@ -64,41 +64,42 @@ def stiffer(factor):
     return law
 
 
-def fitted(throws, law=None):
+def fitted(recordings, law=None):
     start = law or stiffer(2.0)
-    return fit(throws, start, "sticky", seed=0, checkpoint=Checkpoint(None), progress=lambda *_: None)
+    return train(recordings, start, "sticky", seed=0, checkpoint=Checkpoint(None), progress=lambda *_: None)
 
 
-def test_a_law_of_two_throws_explains_both(seen, dropped):  # noqa: F811
-    both = throws(seen, dropped, settings(iterations=14))
-    start = fitted(throws(seen, dropped, settings(iterations=0)))
+def test_a_law_of_two_recordings_explains_both(seen, dropped):  # noqa: F811
+    both = recordings_of(seen, dropped, settings(iterations=14))
+    start = fitted(recordings_of(seen, dropped, settings(iterations=0)))
     end = fitted(both)
-    assert end.error_m < 0.4 * start.error_m
+    assert end.trajectory_error < 0.4 * start.trajectory_error
     with torch.no_grad():
         errors = [
-            float(t.problem.error(t.problem.run(end.law, m, "sticky", t.problem.frames)))
-            for t, m in zip(both, end.motions, strict=True)
+            float(r.objective.trajectory_error(r.objective.problem.run(end.law, state, "sticky", r.frames)))
+            for r, state in zip(both, end.initial_states, strict=True)
         ]
     assert max(errors) < 0.01
-    assert end.error_m == pytest.approx(np.mean(errors), rel=1e-4)
-    for motion, velocity in zip(end.motions, (VELOCITY, DROP), strict=True):
-        np.testing.assert_allclose(motion.velocity.numpy(), velocity, atol=0.1)
+    assert end.trajectory_error == pytest.approx(np.mean(errors), rel=1e-4)
+    for state, velocity in zip(end.initial_states, (VELOCITY, DROP), strict=True):
+        np.testing.assert_allclose(state.velocity.numpy(), velocity, atol=0.1)
 
 
-def test_each_throw_counts_alike(seen, dropped, monkeypatch):  # noqa: F811
-    """A step from the same throw twice is that from it once (later ones differ: steps of motions are clipped)."""
+def test_each_recording_has_the_same_weight(seen, dropped, monkeypatch):  # noqa: F811
+    """A step from the same recording twice equals that from it once (later ones differ: gradients of initial states
+    are clipped)."""
     gradients = []
     of_law = len(list(stiffer(1.0).parameters()))
     with monkeypatch.context() as patched:
         patched.setattr(
-            Descent, "step", lambda self: gradients.append([p.grad.clone() for p in self._parameters[:of_law]])
+            TrainingState, "step", lambda self: gradients.append([p.grad.clone() for p in self._parameters[:of_law]])
         )
-        one = throws(seen, dropped, settings(iterations=1))[:1]
+        one = recordings_of(seen, dropped, settings(iterations=1))[:1]
         fitted(one)
         fitted(one * 2)
     for once, twice in zip(*gradients, strict=True):
         torch.testing.assert_close(twice, once, rtol=1e-4, atol=1e-7)
-    one = throws(seen, dropped, settings(iterations=2))[:1]
+    one = recordings_of(seen, dropped, settings(iterations=2))[:1]
     once, twice = fitted(one), fitted(one * 2)
     assert once.objective < fitted(one, law=stiffer(3.0)).objective
     assert twice.objective == pytest.approx(once.objective, rel=1e-5)
@@ -106,7 +107,7 @@ def test_each_throw_counts_alike(seen, dropped, monkeypatch):  # noqa: F811
     assert once.law.wave_modulus() != pytest.approx(stiffer(2.0).wave_modulus(), rel=1e-2)
 
 
-def test_a_stage_that_is_killed_goes_on_with_all_throws(seen, dropped, tmp_path):  # noqa: F811
+def test_a_stage_that_is_killed_goes_on_with_all_recordings(seen, dropped, tmp_path):  # noqa: F811
     class Stop(Exception):
         pass
 
@@ -117,7 +118,7 @@ def test_a_stage_that_is_killed_goes_on_with_all_throws(seen, dropped, tmp_path)
     config = settings(iterations=3)
     more = {"others": [(dataclasses.replace(scene(), frame_count=FRAMES - 1), dropped)]}
     whole = identify(scene(), seen[0], config, SimulatorConfig(), **more)
-    assert whole.fit["throws"] == 2
+    assert whole.fit["recordings"] == 2
     path = tmp_path / "identify.pt"
     with pytest.raises(Stop):
         identify(scene(), seen[0], config, SimulatorConfig(), **more, checkpoint=Checkpoint(path, every_s=0),
@@ -125,16 +126,16 @@ def test_a_stage_that_is_killed_goes_on_with_all_throws(seen, dropped, tmp_path)
     resumed = identify(scene(), seen[0], config, SimulatorConfig(), **more, checkpoint=Checkpoint(path, every_s=0))
     assert resumed.fit == whole.fit
     assert all(torch.equal(a, b) for a, b in zip(whole.law.parameters(), resumed.law.parameters(), strict=True))
-    with pytest.raises(InputError, match="fitted to one throw"):
+    with pytest.raises(InputError, match="fitted to one recording"):
         identify(scene(), seen[0], settings(law="neo_hookean"), SimulatorConfig(), **more)
 
 
-def test_other_throws_are_checked_before_anything_is_made(tmp_path, capsys, monkeypatch):
+def test_other_recordings_are_checked_before_anything_is_made(tmp_path, capsys, monkeypatch):
     scene_path, out = "assets/sample", tmp_path / "run"
     for options, said in (
         (["--also", str(tmp_path / "none")], "is not a run folder"),
         (["--also", str(out)], "is the run itself"),
-        (["--also", str(tmp_path / "none"), "--law", "newtonian"], "fitted to one throw"),
+        (["--also", str(tmp_path / "none"), "--law", "newtonian"], "fitted to one recording"),
     ):
         monkeypatch.setattr("sys.argv", ["masiv", "identify", scene_path, "--out", str(out), *options])
         with pytest.raises(SystemExit) as left:

@@ -1,0 +1,150 @@
+"""The library: what the commands do, on objects in memory. ``import masiv`` offers these names.
+
+Every function starts Taichi on ``config.arch`` if it is not running yet. SI units, world frame.
+
+Example:
+    scene = masiv.read_scene("assets/sample")
+    config = masiv.load_config("quick")
+    gaussians = masiv.reconstruct(scene, config)
+    trajectory = masiv.estimate_trajectory(scene, gaussians, config)
+    twin = masiv.identify(scene, trajectory, config)
+    rollout = masiv.simulate(twin, frames=40, gravity=(0, -1.62, 0))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from masiv import runtime
+from masiv.config import Config, load_config
+from masiv.errors import InputError
+from masiv.observations.read import read_scene
+from masiv.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from masiv.continuum.trajectory import Trajectory
+    from masiv.scene.scene import Scene
+    from masiv.simulation.simulate import Rollout
+    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.twin import Twin
+
+__all__ = [
+    "estimate_trajectory",
+    "evaluate",
+    "identify",
+    "load_config",
+    "read_scene",
+    "reconstruct",
+    "simulate",
+]
+
+
+def reconstruct(scene: Scene, config: Config | None = None, *, progress: Progress = silent) -> DynamicGaussians:
+    """Dynamic Gaussians of the object that ``scene`` shows (paper, section "Dynamic Gaussian reconstruction").
+
+    All frames and cameras of ``scene`` are fitted: use ``scene.restricted`` to hold some out. Raises InputError if a
+    frame shows no object, MasivError if the fit fails.
+    """
+    from masiv.splat.reconstruct import reconstruct as stage
+
+    config = _started(config)
+    return stage(scene, config.reconstruct, seed=config.seed, progress=progress)
+
+
+def estimate_trajectory(
+    scene: Scene, gaussians: DynamicGaussians, config: Config | None = None, *, progress: Progress = silent
+) -> Trajectory:
+    """Fill the object with particles and follow them: ``positions`` (T, Q, 3) [m] at ``times`` (T,) [s]."""
+    from masiv.continuum.trajectory import estimate_trajectory as stage
+
+    config = _started(config)
+    return stage(scene, gaussians, config.trajectory, seed=config.seed, progress=progress)
+
+
+def identify(
+    scene: Scene, trajectory: Trajectory, config: Config | None = None, *, progress: Progress = silent
+) -> Twin:
+    """Initial velocity and constitutive law from the motion of particles, as a ``Twin``.
+
+    ``config.identify.law`` chooses what is fitted (a neural law by default). Raises MasivError if no law explains the
+    motion. A script needs ``if __name__ == "__main__":`` if ``config.identify.processes`` is not 1.
+    """
+    from masiv.identify.stage import identify as stage
+
+    config = _started(config)
+    return stage(scene, trajectory, config.identify, config.simulator, seed=config.seed, progress=progress)
+
+
+def simulate(
+    twin: Twin,
+    *,
+    frames: int,
+    fps: float | None = None,
+    velocity: Sequence[float] | np.ndarray | None = None,
+    omega: Sequence[float] | np.ndarray | None = None,
+    gravity: Sequence[float] | np.ndarray | None = None,
+    without: Sequence[str] = (),
+    arch: str = "cpu",
+    progress: Progress = silent,
+) -> Rollout:
+    """The first ``frames`` frames of the twin's motion: ``positions`` (frames, Q, 3) float32 [m].
+
+    velocity (3,) [m/s] of the centroid, omega (3,) [rad/s], gravity (3,) [m/s^2]: as identified if None. without: names
+    of effects that are left out. Raises InputError for a vector of another shape or an effect that the twin does not
+    have, NonFiniteError if the motion diverges.
+    """
+    from masiv.simulation.simulate import simulate as stage
+
+    runtime.start(arch)
+    return stage(
+        twin,
+        frames=frames,
+        fps=fps,
+        velocity=_vector("velocity", velocity),
+        omega=_vector("omega", omega),
+        gravity=_vector("gravity", gravity),
+        without=tuple(without),
+        progress=progress,
+    )
+
+
+def evaluate(
+    positions: np.ndarray, truth: np.ndarray | str | Path, frames: Sequence[int] | None = None
+) -> dict[str, Any]:
+    """Chamfer distance [10^3 mm^2] and tracked error [mm] of ``positions`` (T, Q, 3) [m] against true particles.
+
+    truth: (T, P, 3) [m], or a folder with particles_F.npy (P, 3). frames: those compared (all if None).
+    Raises InputError if the shapes do not agree.
+    """
+    from masiv.report.measure import motion_numbers, read_truth
+
+    moved = np.asarray(positions)
+    if moved.ndim != 3 or moved.shape[2] != 3:
+        raise InputError(f"positions have shape {moved.shape}: give (T, Q, 3)")
+    true = np.asarray(truth) if isinstance(truth, np.ndarray) else read_truth(Path(truth), len(moved))
+    if true.ndim != 3 or true.shape[2] != 3:
+        raise InputError(f"the truth has shape {true.shape}: give (T, P, 3)")
+    chosen = list(range(min(len(moved), len(true)))) if frames is None else list(frames)
+    numbers = motion_numbers(moved, true, chosen)
+    if numbers is None:
+        raise InputError("nothing to compare: positions and truth share no frame")
+    return numbers
+
+
+def _started(config: Config | None) -> Config:
+    config = config or load_config()
+    runtime.start(config.arch)
+    return config
+
+
+def _vector(name: str, value: Sequence[float] | np.ndarray | None) -> np.ndarray | None:
+    if value is None:
+        return None
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(f"{name} must be three finite numbers, not {value}")
+    return array

@@ -1,0 +1,1 @@
+"""Classical laws: few parameters, finite differences, Gauss-Newton."""

@@ -1,0 +1,1 @@
+"""What a rollout is compared with: particle paths, surfaces, silhouettes and colors."""

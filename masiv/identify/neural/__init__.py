@@ -1,0 +1,1 @@
+"""Neural laws: gradients by the adjoint of the rollout, Adam."""

@@ -1,0 +1,51 @@
+"""The silhouette of particles against masks that are known pixel by pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from ball import ball_scene, ball_terms
+
+from masiv.identify.losses.images import ImageTerms
+from masiv.identify.losses.picture_window import particle_spacing, picture_window, render_particles, to_world
+
+pytestmark = pytest.mark.usefixtures("taichi")
+
+
+@pytest.fixture(scope="module", params=[0.03, 0.05])
+def terms(request):
+    return ball_terms(ball_scene(), request.param)
+
+
+def error(terms, scale):
+    """Silhouette error of the ball, scaled by ``scale`` about its centre."""
+    problem = terms.problem
+    middle = problem.particles.mean(0)
+    points = middle + scale * (problem.particles - middle)
+    pictures = [(1, view) for view in problem.scene.views]
+    return float(terms.errors(points.expand(problem.samples, -1, -1), pictures)[0])
+
+
+def best_scale(terms):
+    scales = np.arange(0.9, 1.101, 0.02)
+    return float(scales[int(np.argmin([error(terms, scale) for scale in scales]))])
+
+
+def test_a_body_of_the_right_size_is_best(terms):
+    """To 2 %. With half a spacing for every body, the best ball was 6 % too small."""
+    assert best_scale(terms) == pytest.approx(1.0, abs=0.021)
+    other = ImageTerms(terms.problem, with_colors=False)
+    other.splat_sigma = 0.5 * particle_spacing(terms.problem)
+    assert best_scale(other) < 0.95
+
+
+def test_as_many_pixels_as_the_masks(terms):
+    problem = terms.problem
+    points, excess = to_world(problem, problem.particles), []
+    for view in problem.scene.views:
+        window = picture_window(problem.scene, view, 0)
+        with torch.no_grad():
+            alpha = render_particles(window, points, terms.splat_sigma, torch.zeros(problem.count, 3)).alpha
+        excess.append(float((alpha - window.mask).sum() / window.mask.sum()))
+    assert np.mean(excess) == pytest.approx(0, abs=0.01)
