@@ -173,7 +173,6 @@ def damping(
     from masiv.effects.catalogue import effect_named
     from masiv.materials.classical import ClassicalLaw
     from masiv.models.marked_body import marked_body
-    from masiv.models.marker_body import simulated_markers
     from masiv.mpm.config import SimulatorConfig
     from masiv.tracks.read import read_tracks
 
@@ -188,11 +187,12 @@ def damping(
         hz, rate, amplitude = swing(seen.elapsed, seen.positions[:, 0, 0], 7.5)
         rows.append({"measured": name, "hz": hz, "decay_per_s": rate, "amplitude_mm": 1e3 * amplitude})
     for count in particles:
-        body = marked_body(tracks, tracks.runs[0], config, particle_spacing=(9e-5 / count) ** (1 / 3))
+        body = marked_body(tracks, tracks.runs[0], config, particle_spacing=(9e-5 / count) ** (1 / 3), speed=0.3)
         for eta in (0.0, viscosity):  # a fine grid and much viscosity need a smaller Courant number
             began = time.perf_counter()
             members = ((effect_named("viscosity"), torch.tensor([eta])),)
-            tip = simulated_markers(body, law, times, config, members, speed=0.3)[:, 0, 0]
+            acting = body.effects(members, body.context(float(times[-1]), float(times[-1]) / (len(times) - 1)))
+            tip = body.markers_to_world(body.run(law, times, acting)[1])[:, 0, 0]
             hz, rate, amplitude = swing(times[12:], tip[12:], 7.5)
             rows.append({
                 "particles": len(body.particles), "grid_mm": 1e3 * body.spacing, "viscosity": eta, "hz": hz,

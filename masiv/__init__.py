@@ -25,9 +25,7 @@ _MODULE_OF = {
         ("estimate_trajectory", "evaluate", "identify", "load_config", "read_scene", "reconstruct", "simulate"),
         "masiv.api",
     ),
-    **dict.fromkeys(
-        ("RefineRequest", "SceneRequest", "SimulateRequest", "open_run", "reopen_run"), "masiv.pipeline"
-    ),
+    **dict.fromkeys(("RefineRequest", "SceneRequest", "SimulateRequest", "open_run", "reopen_run"), "masiv.pipeline"),
     **dict.fromkeys(("InputError", "MasivError", "NonFiniteError"), "masiv.errors"),
     "Config": "masiv.config",
     "Twin": "masiv.twin",

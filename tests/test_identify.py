@@ -21,13 +21,13 @@ from masiv.identify.neural.starting_law import (
 from masiv.identify.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
-from masiv.models.initial_state import InitialState, estimate_initial_motion
 from masiv.models.filmed_body import FilmedBody
+from masiv.models.initial_state import InitialState, estimate_initial_motion
 from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.simulate import simulate
-from masiv.simulation.subdivide import wholes
+from masiv.simulation.subdivide import merge_subparticles
 from masiv.twin import Twin
 
 GRAVITY = np.array([0.0, -9.8, 0.0])
@@ -130,7 +130,7 @@ def test_an_inelastic_starting_law_must_be_nearer_by_a_margin():
 def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
     trajectory, positions = seen
     twin = identify(scene(), trajectory, settings(), SimulatorConfig())
-    predicted = wholes(simulate(twin, frames=FRAMES + 4).positions, positions.shape[1])
+    predicted = merge_subparticles(simulate(twin, frames=FRAMES + 4).positions, positions.shape[1])
     error = np.linalg.norm(predicted - positions, axis=2).mean(1)
     rigid = np.linalg.norm(positions[-1] - positions[0] - (positions[-1] - positions[0]).mean(0), axis=1).mean()
     assert twin.fit["trajectory_error_mm"] < 8

@@ -11,8 +11,8 @@ from masiv.identify.neural.starting_law import StartingLaw
 from masiv.identify.neural.training import TrainingResult
 from masiv.identify.recording import FitRecording
 from masiv.materials.neural import NeuralLaw
-from masiv.models.initial_state import InitialState
 from masiv.models.filmed_body import FilmedBody
+from masiv.models.initial_state import InitialState
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import silent
 

@@ -17,8 +17,8 @@ from masiv.identify.neural.training import TrainingResult
 from masiv.identify.recording import FitRecording
 from masiv.identify.stage import identify
 from masiv.materials.load import load_law
-from masiv.models.initial_state import InitialState
 from masiv.models.filmed_body import FilmedBody
+from masiv.models.initial_state import InitialState
 from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Frame

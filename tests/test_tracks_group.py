@@ -13,10 +13,11 @@ import yaml
 
 from masiv.errors import InputError
 from masiv.models.base import Model
-from masiv.models.point_mass import RIGID, PointMassModel, mean_diameter
+from masiv.models.point_mass import RIGID, PointMassModel
 from masiv.observations.tracks import flight_observations
 from masiv.refine.config import RefineConfig
 from masiv.refine.pooling import refine_group
+from masiv.tracks.geometry import mean_diameter
 from masiv.tracks.read import read_tracks
 
 pytestmark = pytest.mark.usefixtures("taichi")

@@ -23,7 +23,6 @@ from masiv.models.base import Model
 from masiv.models.clamped_body import ClampedBodyModel
 from masiv.models.families import family_of
 from masiv.models.marked_body import marked_body
-from masiv.models.marker_body import simulated_markers
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
 from masiv.refine.add_effect import refit
@@ -71,7 +70,8 @@ def write_bar(folder: Path, runs) -> Path:
             tip = body.particles[:, 2].max().item()
             members.append((effect_named("point_mass"), torch.tensor([LOAD, 0.0, 0.0, tip])))
         law = ClassicalLaw("neo_hookean", youngs_modulus=YOUNGS, poissons_ratio=RATIO)
-        moved = simulated_markers(body, law, times, SIMULATOR, tuple(members), speed=1.0)
+        acting = body.effects(members, body.context(float(times[-1]), float(times[-1]) / (len(times) - 1)))
+        moved = body.markers_to_world(body.run(law, times, acting)[1])
         free = np.tile(places, (len(times), 1, 1))
         free[:, :3] = moved
         save(folder / f"{name}.csv", at, np.concatenate([still, free]), seed)

@@ -18,9 +18,8 @@ from masiv.cli import main
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
-from masiv.identify.config import IdentifyConfig
-from masiv.models.filmed_body import FilmedBody
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, rigid_initial_state
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame

@@ -18,11 +18,11 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.identify.classical.fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
-from masiv.identify.problem import Problem
 from masiv.identify.losses.objective import Objective
 from masiv.identify.neural.starting_law import choose_starting_laws, search_cost
 from masiv.models.base import Model
 from masiv.models.families import FAMILIES
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import InitialState
 from masiv.mpm.config import SimulatorConfig

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.losses.objective import Objective
-from masiv.models.initial_state import InitialMotion, InitialState, estimate_initial_motion
 from masiv.models.filmed_body import FilmedBody
+from masiv.models.initial_state import InitialMotion, InitialState, estimate_initial_motion
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Scene
 

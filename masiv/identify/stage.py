@@ -21,13 +21,13 @@ from masiv.identify.losses.objective import Objective
 from masiv.identify.neural.multi_start import fit_neural_law
 from masiv.identify.recording import FitRecording, prepare_recording
 from masiv.identify.result import IdentificationResult
-from masiv.models.initial_state import InitialState
 from masiv.models.filmed_body import FilmedBody
+from masiv.models.initial_state import InitialState
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
-from masiv.subsample import random_subset
 from masiv.simulation.twin_effects import effect_members
+from masiv.subsample import random_subset
 from masiv.twin import Twin
 
 
@@ -118,9 +118,7 @@ def relearn(
     return replace(learned, fit={**twin.fit, **result.report, **errors})
 
 
-def _coarse(
-    scene: Scene, trajectory: Trajectory, recording: FitRecording, seed: int
-) -> Callable[[], Objective]:
+def _coarse(scene: Scene, trajectory: Trajectory, recording: FitRecording, seed: int) -> Callable[[], Objective]:
     """Makes the objective of ``recording`` with few particles, and the same known effects."""
     config, whole = recording.objective.config, recording.objective.problem
 

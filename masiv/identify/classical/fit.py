@@ -18,16 +18,16 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import NonFiniteError
 from masiv.identify.classical.residuals import JointResidual
 from masiv.identify.classical.search import search_family
+from masiv.identify.losses.geometry import mean_distance
 from masiv.identify.losses.objective import Objective
 from masiv.inference.least_squares import Estimate, clipped_step, covariance, gauss_newton, with_start_values
 from masiv.inference.noise_model import effective_samples
 from masiv.inference.robust import NORMAL_MAD, soft_l1_sum, soft_l1_weight
 from masiv.materials.classical import ClassicalLaw
-from masiv.identify.losses.geometry import mean_distance
 from masiv.models.families import FAMILIES, Family, law_of
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.models.parameters import Parameter
-from masiv.models.filmed_body import FilmedBody
 from masiv.progress import Progress
 
 MIN_COST_DECREASE = 1e-3

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 
 from masiv.errors import MasivError, NonFiniteError
-from masiv.identify.losses.objective import Objective
 from masiv.identify.classical.residuals import PathResidual
 from masiv.identify.losses.geometry import mean_distance
+from masiv.identify.losses.objective import Objective
 from masiv.models.families import Family
 from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.progress import Progress

@@ -16,8 +16,8 @@ from masiv.identify.config import IdentifyConfig
 from masiv.identify.losses.geometry import chamfer_error, surface_points, trajectory_error
 from masiv.identify.losses.images import ImageTerms, pictures_of_each_frame
 from masiv.materials.law import Law
-from masiv.models.initial_state import InitialState
 from masiv.models.filmed_body import FilmedBody
+from masiv.models.initial_state import InitialState
 
 VIEWS_COMPARED = 3
 """Views of each frame in which finished fits are compared."""
