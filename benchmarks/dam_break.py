@@ -19,12 +19,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import taichi as ti
 import torch
 
 from masiv import runtime
-from masiv.effects._walls import walled
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import EffectContext
+from masiv.effects.boundary.planes import PlanesEffect, with_planes
+from masiv.effects.context import EffectContext
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import substeps_per_frame
@@ -35,6 +36,31 @@ GRAVITY, DENSITY, VISCOSITY = 9.81, 1000.0, 1.0e-3
 FILES = ("martin_moyce_a1.125in.csv", "martin_moyce_a2.25in.csv", "koshizuka_oka.csv")
 PIECE = 0.05
 """Of T, between two states that are looked at."""
+
+
+def _slide_along(planes: int):
+    @ti.func
+    def tangential(x, v, t, dt, dx, c):
+        out = v
+        for p in ti.static(range(planes)):
+            n = ti.Vector([c[4 * p], c[4 * p + 1], c[4 * p + 2]])
+            if x.dot(n) <= c[4 * p + 3] + 1e-3 * dx:  # a plane of nodes in the wall belongs to it
+                out -= out.dot(n) * n
+        return out
+
+    return tangential
+
+
+class Walls(PlanesEffect):
+    r"""$v_i \cdot n_p = 0$ for $n_p \cdot x_i \le h_p$, for each plane $p$: a wall without friction, or a plane of
+    symmetry. Normals point into the matter and are perpendicular to each other, so that the order of walls in a corner
+    does not matter. A plane with h beyond all matter makes the motion plane."""
+
+    name = "walls"
+    looks_like = "a part of the body slides along a wall"
+
+    def node_velocity(self):
+        return _slide_along(self.planes)
 
 
 @dataclass(frozen=True)
@@ -84,7 +110,7 @@ def collapse(
         torch.tensor([0.0, -GRAVITY, 0.0]), x, DENSITY * gap * gap * gap, height, until * to_seconds
     )
     planes = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # the wall; and nothing moves along z
-    effects = walled(ActiveEffects((), setting), planes, torch.tensor([0.0, 1e3]))
+    effects = with_planes(ActiveEffects((), setting), Walls, planes, torch.tensor([0.0, 1e3]))
     state = at_rest(x, torch.zeros_like(x), torch.zeros(len(x), 3, 3))
     began, rows, pieces = time.perf_counter(), [], round(until / piece)
     for k in range(pieces + 1):

@@ -16,7 +16,7 @@ from unknown_effects import UNKNOWN
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import rollout

@@ -2,8 +2,7 @@
 
     python examples/free_fall_with_drag.py [FOLDER]          (a few seconds)
 
-The data are the closed form y(t) = h - ln cosh(t sqrt(g k)) / k with 1 mm of noise.
-"""
+The data are the closed form y(t) = h - ln cosh(t sqrt(g k)) / k with 1 mm of noise."""
 
 import sys
 from pathlib import Path

@@ -19,20 +19,26 @@ from masiv.splat.config import ReconstructConfig
 from masiv.strict import read_yaml, validated
 from masiv.tracks.config import TracksConfig
 
+RENAMED_KEYS = {
+    "reconstruct.pictures": "batch_size",
+    "reconstruct.first_frame_share": "first_frame_fraction",
+    "reconstruct.growth_share": "growth_fraction",
+    "reconstruct.followed_rate": "canonical_rate_factor",
+    "reconstruct.final_rate": "final_rate_factor",
+    "trajectory.carve_misses": "carve_images",
+    "trajectory.batch": "batch_size",
+    "trajectory.match_every": "match_interval",
+    "tracks.highest_poissons_ratio": "max_poissons_ratio",
+    "identify.polish": "surface_finetune",
+    "identify.polish_silhouette_weight": "finetune_silhouette_weight",
+    "identify.paint_weight": "color_weight",
+    "identify.polish_paint_weight": "finetune_color_weight",
+}
+"""Keys of earlier versions: section and old name -> new name in the same section."""
+RENAMED_VALUES = {"identify.start": RENAMED_STARTS}
+"""Values of earlier versions: section and key -> old value -> new value."""
 Preset = Literal["quick", "standard", "paper"]
 DEFAULT_PRESET = "standard"
-
-RENAMED_KEYS = {
-    "identify": {
-        "polish": "surface_finetune",
-        "polish_silhouette_weight": "finetune_silhouette_weight",
-        "paint_weight": "color_weight",
-        "polish_paint_weight": "finetune_color_weight",
-    },
-}
-"""Keys of older versions and their names today, by section."""
-RENAMED_VALUES = {"identify": {"start": RENAMED_STARTS}}
-"""Values of older versions and their names today, by section and key."""
 
 
 class Config(BaseModel):
@@ -63,9 +69,9 @@ def load_config(
     is given, only its seed and arch do.
     Raises InputError for an unknown preset or key, naming the nearest known one, and for a value out of range.
     """
-    from_file = {} if path is None else read_yaml(path)
+    from_file = {} if path is None else renamed_keys(read_yaml(path))
     name = preset or from_file.get("preset")
-    merged: dict[str, Any] = dict(base or {})
+    merged: dict[str, Any] = renamed_keys(base or {})
     if name is not None or base is None:
         kept = {key: merged[key] for key in ("seed", "arch") if key in merged}
         merged = {**kept, **preset_overlay(str(name or DEFAULT_PRESET))}
@@ -84,15 +90,19 @@ def load_config(
     return validated(Config, merged, "the command line" if path is None else str(path))
 
 
-def with_current_names(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration of an existing run, with the keys and values of older versions renamed."""
-    result = dict(config)
-    for section in {*RENAMED_KEYS, *RENAMED_VALUES} & result.keys():
-        keys, values = RENAMED_KEYS.get(section, {}), RENAMED_VALUES.get(section, {})
-        renamed = {keys.get(key, key): value for key, value in result[section].items()}
-        result[section] = {
-            key: values[key].get(value, value) if key in values else value for key, value in renamed.items()
-        }
+def renamed_keys(config: Mapping[str, Any]) -> dict[str, Any]:
+    """``config``, of a run or a file of this or an earlier version, with the present names of its keys and values."""
+    result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in config.items()}
+    for old, new in RENAMED_KEYS.items():
+        section, key = old.split(".")
+        values = result.get(section)
+        if isinstance(values, dict) and key in values:
+            values.setdefault(new, values.pop(key))
+    for name, renamed in RENAMED_VALUES.items():
+        section, key = name.split(".")
+        values = result.get(section)
+        if isinstance(values, dict) and key in values:
+            values[key] = renamed.get(values[key], values[key])
     return result
 
 

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from masiv.checkpoint import Checkpoint
-from masiv.config import with_current_names
 from masiv.errors import InputError
 from masiv.files import write_yaml
 from masiv.strict import read_yaml
@@ -65,7 +64,10 @@ class RunFolder:
             raise InputError(
                 f"{path / 'run.yaml'} was not written by this version of masiv: start a new run with --out"
             )
-        return cls(path, {**record, "config": with_current_names(record["config"])})
+        from masiv.config import renamed_keys
+
+        record["config"] = renamed_keys(record["config"])
+        return cls(path, record)
 
     @classmethod
     def create_or_resume(cls, path: Path, request: Request) -> RunFolder:

@@ -1,165 +1,165 @@
-"""Simulations side by side: processes that each have a Taichi of their own, on one thread.
+"""Tasks in several processes, each with its own Taichi on one thread.
 
-A rollout of a few thousand particles gains little from a second thread, and two rollouts in two processes take as
-long as one. A rollout is the same to the bit, wherever it runs.
+A rollout of a few thousand particles gains little from a second thread, and two rollouts in two processes take as long
+as one. A rollout has the same bits in every process.
 
-What a process is given, and what it gives back, are copies. multiprocessing's own pickling would move the memory of
-every torch tensor among them to one place that both processes share, in a thread of its own, under a simulation that
-may be reading it.
+Arguments and results are pickled here, since the pickling of ``multiprocessing`` would move the memory of each torch
+tensor to a place that both processes share, while a simulation may be reading it.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import pickle
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from typing import Any
 
 from masiv import runtime
 from masiv.errors import InputError, MasivError
 
-ONE_THREAD = {
-    "TI_CPU_MAX_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
-AT_MOST = 4
+ONE_THREAD = dict.fromkeys(
+    ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
+"""Environment variables that limit a process to one thread, if they are set before torch and Taichi are imported."""
+MAX_PROCESSES = 4
 
 
-def processes_wanted(asked: int) -> int:
-    """``asked``, or where that is 0 one process a core that Taichi may use, four at most; one on a GPU."""
+def process_count(asked: int) -> int:
+    """``asked``, or if that is 0 the cores that Taichi may use, at most ``MAX_PROCESSES``; 1 on a GPU."""
     if runtime.running_arch() != "cpu":
         return 1
-    return asked or min(runtime.threads(), AT_MOST)
+    return asked or min(runtime.threads(), MAX_PROCESSES)
 
 
 class TaskError:
-    """What a task that raised a MasivError gives: what it said, and whether the input was to blame."""
+    """The result of a task that raised a MasivError: its message, and whether it was an InputError."""
 
-    def __init__(self, failed: MasivError) -> None:
-        self.reason = str(failed)
-        self.kind = InputError if isinstance(failed, InputError) else MasivError
+    def __init__(self, error: MasivError) -> None:
+        self.reason = str(error)
+        self.kind = InputError if isinstance(error, InputError) else MasivError
 
 
-def unwrap(found: Any) -> Any:
-    """``found``, unless it is ``TaskError``. Raises MasivError, InputError where the input was to blame."""
-    if isinstance(found, TaskError):
-        raise found.kind(found.reason)
-    return found
+def unwrap(result: Any) -> Any:
+    """``result`` of a task. Raises the MasivError or InputError of a ``TaskError``."""
+    if isinstance(result, TaskError):
+        raise result.kind(result.reason)
+    return result
 
 
 class Workers:
-    """``processes`` (1: this one) that run tasks. Use as a context; the processes start with the first tasks. key: of
-    the configuration, where their number comes from.
+    """A pool of ``processes`` that run tasks; with 1, tasks run in this process.
 
-    A script that uses more than one needs ``if __name__ == "__main__":`` around what it does, as ever with processes.
+    Use as a context. The processes start with the first task; if the block raises, they are terminated at once. key:
+    of the configuration, that sets their number, for messages. A script that uses more than one process needs
+    ``if __name__ == "__main__":``, as always with ``multiprocessing``.
     """
 
     def __init__(self, processes: int = 1, key: str = "refine.processes") -> None:
         self.processes = processes
         self.key = key
-        self._pool: Any = None
+        self._pool: ProcessPoolExecutor | None = None
+        self._started: set[Any] = set()
 
     def __enter__(self) -> Workers:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._pool is None:
+            return
+        if kind is not None:
+            for process in self._started:
+                process.terminate()
+        self._pool.shutdown(cancel_futures=True)
+        self._pool = None
 
-    def begin(self) -> None:
-        """Start the processes, where there are several, and go on: they take seconds to be ready for a task."""
+    def start(self) -> None:
+        """Start the processes, if there are several, and return at once: they need seconds until the first task."""
         if self.processes > 1:
-            self._started()
+            self._running()
 
-    def map(self, function: Callable, tasks: Iterable[tuple]) -> Iterator[Any]:
-        """``function(*task)`` of each, in order, or ``TaskError``. The function and its arguments must be picklable.
+    def map(self, function: Callable, tasks: Iterable[tuple], *, shared: tuple = ()) -> Iterator[Any]:
+        """``function(*shared, *task)`` of each task, in order, or ``TaskError``.
 
-        Raises MasivError where a process dies."""
+        ``shared`` is pickled once for all tasks, and each task in another process gets its own copy. The function and
+        its arguments must be picklable. Raises MasivError if a process dies.
+        """
         tasks = list(tasks)
         if self.processes == 1 or len(tasks) == 1:
-            yield from (run_task(function, task) for task in tasks)
+            yield from (run_task(function, (*shared, *task)) for task in tasks)
             return
-        futures = [self._submitted(function, task) for task in tasks]
-        try:
-            for future in futures:
-                yield self._result(future)
-        finally:
-            for future in futures:
-                future.cancel()
+        with tempfile.TemporaryDirectory(prefix="masiv-") as folder:
+            path = Path(folder) / "shared.pickle"
+            path.write_bytes(pickle.dumps(shared, pickle.HIGHEST_PROTOCOL))
+            futures = [self._submit(function, task, path) for task in tasks]
+            try:
+                for future in futures:
+                    yield self._result(future)
+            finally:
+                for future in futures:
+                    future.cancel()
 
     def submit(self, function: Callable, task: tuple) -> Callable[[], Any]:
-        """Begin ``function(*task)`` in another process and go on. Returns a function that waits for its result.
-        Where there is no other process the task runs then. Raises MasivError where the process has died."""
+        """Start ``function(*task)`` in another process. Returns a function that waits for its result.
+
+        With one process the task runs in that function. Raises MasivError if the process died.
+        """
         if self.processes == 1:
             return lambda: run_task(function, task)
-        future = self._submitted(function, task)
+        future = self._submit(function, task, None)
         return lambda: self._result(future)
 
-    def _submitted(self, function: Callable, task: tuple) -> Any:
-        """The future of ``function(*task)`` in another process."""
-        return self._started().submit(_run_pickled_task, pickle.dumps((function, task)))
+    def _submit(self, function: Callable, task: tuple, shared: Path | None) -> Future[bytes]:
+        return self._running().submit(_run_pickled_task, pickle.dumps((function, task)), shared)
 
-    def _result(self, future: Any) -> Any:
-        from concurrent.futures.process import BrokenProcessPool
-
+    def _result(self, future: Future[bytes]) -> Any:
         try:
             return pickle.loads(future.result())
         except BrokenProcessPool as died:
-            raise MasivError(f"a worker process died, of too little memory perhaps: set {self.key} to 1") from died
+            raise MasivError(f"a worker process died, perhaps for lack of memory: set {self.key} to 1") from died
 
-    def _started(self) -> Any:
+    def _running(self) -> ProcessPoolExecutor:
         if self._pool is None:
-            import multiprocessing
-            from concurrent.futures import ProcessPoolExecutor
-
+            others = set(multiprocessing.active_children())
             spawn = multiprocessing.get_context("spawn")  # Taichi's threads do not survive a fork
-            self._pool = ProcessPoolExecutor(self.processes, spawn, _start, (runtime.running_arch(),))
-            with _environment(ONE_THREAD):  # which a process reads when it starts
-                for _ in range(self.processes):
-                    self._pool.submit(_nothing)
+            self._pool = ProcessPoolExecutor(self.processes, spawn, _initialize, (runtime.running_arch(),))
+            for _ in range(self.processes):  # a pool starts a process for each task that no idle process can take
+                self._pool.submit(_do_nothing)
+            self._started = set(multiprocessing.active_children()) - others
         return self._pool
 
 
-@contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _start(arch: str) -> None:
+def _initialize(arch: str) -> None:
+    """Limit a new process to one thread and start Taichi. torch and Taichi are imported here at the earliest."""
+    os.environ.update(ONE_THREAD)
     import multiprocessing.util
 
     import torch
 
     ti = runtime.start(arch)
     torch.set_num_threads(1)
-    # What atexit has is not called in such a process; this writes the kernel cache.
+    # Such a process does not call the functions of ``atexit``. This one writes the cache of compiled kernels.
     multiprocessing.util.Finalize(None, ti.reset, exitpriority=1)
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     pass
 
 
-def _run_pickled_task(pickled: bytes) -> bytes:
+def _run_pickled_task(pickled: bytes, shared: Path | None) -> bytes:
     """``run_task`` in another process."""
-    return pickle.dumps(run_task(*pickle.loads(pickled)))
+    function, task = pickle.loads(pickled)
+    first = () if shared is None else pickle.loads(shared.read_bytes())
+    return pickle.dumps(run_task(function, (*first, *task)))
 
 
 def run_task(function: Callable, task: tuple) -> Any:
-    """``function(*task)``, or ``TaskError`` where that raises a MasivError."""
+    """``function(*task)``, or a ``TaskError`` if that raises a MasivError."""
     try:
         return function(*task)
-    except MasivError as failed:
-        return TaskError(failed)
+    except MasivError as error:
+        return TaskError(error)

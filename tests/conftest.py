@@ -1,4 +1,4 @@
-"""Shared set-up: Taichi on the CPU, torch on one thread (two spin against each other on a busy machine)."""
+"""Shared set-up: Taichi on the CPU; one thread a process, since ``make test`` runs one process a core."""
 
 import os
 
@@ -6,8 +6,7 @@ import pytest
 
 from masiv.workers import ONE_THREAD
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # as many processes as cores; read when numpy, torch and Taichi start
-    os.environ.update(ONE_THREAD)
+os.environ.update(ONE_THREAD)  # read when numpy, torch and Taichi start
 
 import torch
 

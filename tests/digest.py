@@ -10,10 +10,11 @@ from test_rasterise import BACKGROUND, make_camera, make_gaussians, weighted
 from masiv import runtime
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.mpm.simulator import SERIAL, Simulator
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.taped_rollout import SERIAL_PARTICLES
 from masiv.splat.rasteriser import render
 
-COUNT, STEPS = SERIAL + 200, 24
+COUNT, STEPS = SERIAL_PARTICLES + 200, 24
 
 
 def simulated() -> list[torch.Tensor]:

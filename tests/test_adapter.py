@@ -15,7 +15,8 @@ from masiv.materials.classical import PARAMETERS, ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 
 
 def adapter(kind, seed=None):
@@ -63,21 +64,21 @@ def test_kernels_of_an_adapter_equal_its_definition_and_its_gradient(kind):
     sim = Simulator(particle_count=16, spacing=0.1, substep=1e-3, volume=1.0, density=1.0, gravity=(0, 0, 0), dtype=F64,
                     max_substeps=64, grid_nodes=1 << 15)  # fmt: skip
     zeros = torch.zeros(16, 3, dtype=F64)
-    sim.k.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
-    bound = law.bind(sim.k, 16, 1e-3)
+    sim.kernels.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
+    bound = law.bind(sim.kernels, 16, 1e-3)
     bound.forward(0, 16)
     out = law.project(f, 1e-3)
-    ours = torch.as_tensor(sim.k.deformation_gradient.to_numpy()[0, :16])
+    ours = torch.as_tensor(sim.kernels.deformation_gradient.to_numpy()[0, :16])
     torch.testing.assert_close(ours, out.detach(), rtol=1e-8, atol=1e-9)
     bars = gradients(16, 1.0, seed=1), 1e-4 * gradients(16, 1.0, seed=2)
-    sim.k.gradient_bar.from_numpy(np.resize(bars[0].numpy(), (1024, 3, 3)))
-    sim.k.stress_bar.from_numpy(np.resize(bars[1].numpy(), (1024, 3, 3)))
+    sim.kernels.gradient_bar.from_numpy(np.resize(bars[0].numpy(), (1024, 3, 3)))
+    sim.kernels.stress_bar.from_numpy(np.resize(bars[1].numpy(), (1024, 3, 3)))
     bound.backward(0, 16)
     trial = f.clone().requires_grad_()
     trained = [p for p in law.parameters() if p.requires_grad]
     out = law.project(trial, 1e-3)
     expected = torch.autograd.grad([out, law.stress(out)], [trial, *trained], bars)
-    trial_bar = torch.as_tensor(sim.k.trial_bar.to_numpy()[:16])
+    trial_bar = torch.as_tensor(sim.kernels.trial_bar.to_numpy()[:16])
     torch.testing.assert_close(trial_bar, expected[0], rtol=1e-6, atol=1e-7 * float(expected[0].abs().max()))
     found = [g for g in bound.parameter_gradients() if g is not None]
     for mine, theirs in zip(found, expected[1:], strict=True):
@@ -96,6 +97,7 @@ def test_an_adapter_survives_saving(tmp_path):
     assert law.description() == again.description()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("taichi")
 def test_fit_of_an_adapter_improves_on_its_base_and_resumes(body, tmp_path):  # noqa: F811
     class Stop(Exception):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
 import pytest
 
-from masiv.config import Config, load_config, preset_overlay, with_current_names
+from masiv.config import RENAMED_KEYS, Config, load_config, preset_overlay, renamed_keys
 from masiv.errors import InputError
 
 
@@ -59,7 +60,7 @@ def test_keys_and_values_of_older_versions_have_new_names():
         "identify": {"polish": False, "polish_silhouette_weight": 2.0, "polish_paint_weight": 0.5, "paint_weight": 0.2,
                      "start": "honey", "contact": "slip"},
     }  # fmt: skip
-    new = with_current_names(old)
+    new = renamed_keys(old)
     assert new["seed"] == 3
     assert new["identify"] == {
         "surface_finetune": False, "finetune_silhouette_weight": 2.0, "finetune_color_weight": 0.5, "color_weight": 0.2,
@@ -69,7 +70,19 @@ def test_keys_and_values_of_older_versions_have_new_names():
     assert (identify.surface_finetune, identify.start, identify.color_weight) == (False, "maxwell_fluid", 0.2)
     assert old["identify"]["start"] == "honey"
     current = load_config().model_dump(mode="json")
-    assert with_current_names(current) == current
+    assert renamed_keys(current) == current
+
+
+@pytest.mark.parametrize("old", RENAMED_KEYS)
+def test_keys_of_earlier_versions_are_read(tmp_path, old):
+    section, key = old.split(".")
+    new = RENAMED_KEYS[old]
+    default = getattr(getattr(Config(), section), new)
+    value = (not default) if isinstance(default, bool) else 0.25 if isinstance(default, float) else 151
+    from_file = load_config(None, write(tmp_path, f"{section}: {{{key}: {json.dumps(value)}}}"))
+    assert getattr(getattr(from_file, section), new) == value
+    assert load_config(base={section: {key: value}}) == from_file
+    assert renamed_keys({section: {key: 1, new: 2}}) == {section: {new: 2}}
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 import torch
 
+import masiv.effects
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
+from masiv.effects.effect import KINDS, ContactEffect, Effect, NodalEffect
 from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.initial_state import rigid_initial_state
@@ -67,7 +71,7 @@ def test_absent_at_zero_strength(name):
 
 
 CASES = [(name, "sticky") for name in effects()]
-CASES += [(name, c) for name, e in effects().items() if e.on_grid == "ground" for c in ("release", "slip")]
+CASES += [(name, c) for name, e in effects().items() if isinstance(e, ContactEffect) for c in ("release", "slip")]
 
 
 @pytest.mark.parametrize(("name", "contact"), CASES)
@@ -104,7 +108,14 @@ def gradients(effect, contact, dtype):
     return torch.cat([bar.to(F64) for bar in bars])
 
 
-@pytest.mark.parametrize(("name", "contact"), CASES)
+ONE_A_KIND = ("ground_friction", "ground_height", "point_force", "point_mass", "quadratic_drag", "viscosity")
+"""On the contact, a shift, a force at a place, masses, on the nodes of the grid, in the stress."""
+
+
+@pytest.mark.parametrize(
+    ("name", "contact"),
+    [pytest.param(*c, marks=() if c[0] in ONE_A_KIND and c[1] == "sticky" else pytest.mark.slow) for c in CASES],
+)
 def test_gradient_in_single_precision(name, contact):
     """What is fitted runs in it, and a compiler that is told to leave out a pass may differentiate it wrongly."""
     double, single = (gradients(effects()[name], contact, dtype) for dtype in (F64, torch.float32))
@@ -158,3 +169,66 @@ def test_several_effects_at_once():
             down[k][0] -= step
             slope = (loss(up) - loss(down)) / (2 * step)
             assert thetas[k].grad[0].item() == pytest.approx(slope.item(), rel=2e-4), name
+
+
+LIFT = """
+import taichi as ti
+
+from masiv.effects.context import EffectParameter
+from masiv.effects.effect import NodalEffect
+
+
+@ti.func
+def _turned(x, v, t, dt, dx, c):
+    return v + dt * c[0] * ti.Vector([-v[1], v[0], 0.0])
+
+
+class Lift(NodalEffect):
+    name = "lift"
+    looks_like = "a spinning ball curves"
+    parameters = (EffectParameter("rate", "1/s", -20.0, 20.0, 0.05),)
+
+    def node_velocity(self):
+        return _turned
+"""
+
+
+@pytest.fixture
+def lift(tmp_path, monkeypatch):
+    """An effect whose file is added to the folder while masiv runs."""
+    (tmp_path / "lift.py").write_text(LIFT)
+    monkeypatch.setattr(masiv.effects, "__path__", [*masiv.effects.__path__, str(tmp_path)])
+    effects.cache_clear()
+    yield effects()["lift"]
+    effects.cache_clear()
+    sys.modules.pop("masiv.effects.lift")
+
+
+def test_an_effect_is_added_by_its_file_alone(lift):
+    """Found by name, simulated, differentiated."""
+    x, theta = body(height=5.0), torch.tensor([3.0], dtype=F64, requires_grad=True)
+    start = rigid_initial_state(x, torch.tensor([2.0, 0.0, 1.0], dtype=F64), torch.zeros(3, dtype=F64))
+    active = ActiveEffects(((lift, theta),), setting(x))
+    last = rollout(simulator(len(x), gravity=(0, 0, 0)), LAW, start, STEPS, [STEPS - 1, STEPS], active)
+    velocity = ((last[1] - last[0]) / DT).mean(0)
+    expected = 2.0 * (1 + 3j * DT) ** STEPS
+    assert velocity.tolist() == pytest.approx([expected.real, expected.imag, 1.0], abs=1e-9)
+    velocity[1].backward()
+    slope = 2.0 * STEPS * 1j * DT * (1 + 3j * DT) ** (STEPS - 1)
+    assert theta.grad.item() == pytest.approx(slope.imag, rel=1e-6)
+
+
+def test_an_effect_without_its_method_cannot_be_made():
+    """Each kind has one abstract method, and an effect of no kind is refused when it is defined."""
+    for kind in KINDS:
+        assert len(kind.__abstractmethods__) == 1
+    with pytest.raises(TypeError, match="node_velocity"):
+        type("Nothing", (NodalEffect,), {"name": "nothing"})()
+    with pytest.raises(TypeError, match="derive it from one of the kinds"):
+        type("Nowhere", (Effect,), {"name": "nowhere"})
+
+
+def test_values_of_another_shape_are_refused():
+    x = body()
+    with pytest.raises(InputError, match="linear_drag: values of shape \\(3,\\)"):
+        ActiveEffects(((effects()["linear_drag"], torch.zeros(3, dtype=F64)),), setting(x))

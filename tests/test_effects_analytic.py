@@ -237,17 +237,17 @@ def test_restitution_frees_what_sticky_ground_keeps():
 def test_a_force_is_periodic_when_it_has_come_round():
     shaken = effects()["periodic_force"]
     theta = torch.tensor([1.0, 0, 0, 0, 0, 0, 2.0])
-    assert shaken.identifiability_issue(theta, 0.6, torch.zeros(1, 3)) is None
-    assert "no whole period of 2 Hz" in shaken.identifiability_issue(theta, 0.4, torch.zeros(1, 3))
-    assert effects()["linear_drag"].identifiability_issue(torch.tensor([1.0]), 0.01, torch.zeros(1, 3)) is None
+    assert shaken.hints.identifiability_issue(theta, 0.6, torch.zeros(1, 3)) is None
+    assert "no whole period of 2 Hz" in shaken.hints.identifiability_issue(theta, 0.4, torch.zeros(1, 3))
+    assert effects()["linear_drag"].hints.identifiability_issue(torch.tensor([1.0]), 0.01, torch.zeros(1, 3)) is None
 
 
 def test_a_swirl_far_from_its_axis_is_a_uniform_force():
     random = np.random.default_rng(0)
     places = torch.tensor(random.uniform((0.1, 0.3, -0.2), (0.5, 0.7, 0.2), (200, 3)))  # 0.16 m about their mean
     swirl = effects()["swirl"]
-    assert swirl.identifiability_issue(torch.tensor([6.0, 0.0, 0.0]), 0.5, places) is None
-    assert "is but a uniform force" in swirl.identifiability_issue(torch.tensor([0.6, 0.3, -1.0]), 0.5, places)
+    assert swirl.hints.identifiability_issue(torch.tensor([6.0, 0.0, 0.0]), 0.5, places) is None
+    assert "is but a uniform force" in swirl.hints.identifiability_issue(torch.tensor([0.6, 0.3, -1.0]), 0.5, places)
 
 
 @torch.enable_grad()

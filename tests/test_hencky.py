@@ -64,13 +64,13 @@ def mapped(kind, f, c):
 @pytest.fixture(scope="module")
 def apply(taichi):
     """A function (kind, F) -> (F, tau) of the kernels, in the precision of F; what was compiled is kept."""
-    from masiv.kernels import tensor
+    from masiv.kernels.laws import law_function
 
     def compiled(kind, real):
         before, after, stress = (taichi.Matrix.field(3, 3, real, shape=COUNT) for _ in range(3))
         coefficients = taichi.Vector.field(len(LAWS[kind]), real, shape=())
         coefficients[None] = LAWS[kind]
-        law = tensor.CLASSICAL[kind]
+        law = law_function(kind)
 
         @taichi.kernel
         def kernel():

@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
+from masiv.kernels.lattice import LATTICE_COUNTS, LATTICE_STEP
 from masiv.materials import table
 from masiv.materials.classical import DIFFERENTIABLE, PARAMETERS, ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw, strain_invariants
 from masiv.mpm.rollout import at_rest
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.pretraining.pretrain import MATERIALS, pretrained_path
 
 F64 = torch.float64
@@ -115,19 +117,19 @@ def test_a_steep_rate_is_perfect_plasticity():
     assert 0.03 < float(kept[beyond].min()) < float(kept[beyond].max()) < 1.1 * float(kept[beyond].min())
 
 
-def test_gentle_is_the_largest_gentle_table_below():
-    shape = (*table.COUNTS, 1)
+def test_the_envelope_is_the_largest_lipschitz_table_below():
+    shape = (*LATTICE_COUNTS, 1)
     values = 5 * torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=F64)
     values[20, 10, 4] = 0.0
-    out = table.gentle(values.reshape(-1, 1)).reshape(shape)
+    out = table.lipschitz_envelope(values.reshape(-1, 1)).reshape(shape)
     assert (out <= values).all()
     for axis in range(3):
-        assert float(out.diff(dim=axis).abs().max()) <= table.STEP + table.ROUNDING
+        assert float(out.diff(dim=axis).abs().max()) <= LATTICE_STEP + table.ROUNDING
     i, j, k = 22, 9, 7
-    cone = sum(abs(a - b) for a, b in zip((i, j, k), (20, 10, 4), strict=True)) * table.STEP
+    cone = sum(abs(a - b) for a, b in zip((i, j, k), (20, 10, 4), strict=True)) * LATTICE_STEP
     assert float(out[i, j, k]) <= cone + 1e-12
-    tiny = torch.full((math.prod(table.COUNTS), 1), 1e-9)
-    assert torch.equal(table.gentle(tiny), tiny)
+    tiny = torch.full((math.prod(LATTICE_COUNTS), 1), 1e-9)
+    assert torch.equal(table.lipschitz_envelope(tiny), tiny)
 
 
 def test_relaxation_removes_strain_and_keeps_volume():
@@ -150,11 +152,11 @@ def test_kernels_equal_the_definition(name):
     sim = Simulator(particle_count=64, spacing=0.1, substep=1e-3, volume=1.0, density=1.0, gravity=(0, 0, 0), dtype=F64,
                     max_substeps=64, grid_nodes=1 << 15)  # fmt: skip
     zeros = torch.zeros(64, 3, dtype=F64)
-    sim.k.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
-    law.bind(sim.k, 64, 1e-3).forward(0, 64)
+    sim.kernels.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
+    law.bind(sim.kernels, 64, 1e-3).forward(0, 64)
     expected = law.project(f, 1e-3).detach()
-    ours = torch.as_tensor(sim.k.deformation_gradient.to_numpy()[0, :64])
-    stress = torch.as_tensor(sim.k.kirchhoff_stress.to_numpy()[0, :64])
+    ours = torch.as_tensor(sim.kernels.deformation_gradient.to_numpy()[0, :64])
+    stress = torch.as_tensor(sim.kernels.kirchhoff_stress.to_numpy()[0, :64])
     torch.testing.assert_close(ours, expected.expand_as(f).contiguous(), rtol=1e-9, atol=1e-11)
     scale = float(law.stress(expected.expand_as(f)).detach().abs().max())
     torch.testing.assert_close(stress, law.stress(expected.expand_as(f)).detach(), rtol=1e-9, atol=1e-9 * scale)
@@ -274,17 +276,17 @@ def test_adjoint_of_a_classical_law_equals_autograd(kind):
     sim = Simulator(particle_count=8, spacing=0.1, substep=1e-3, volume=1.0, density=1.0, gravity=(0, 0, 0), dtype=F64,
                     max_substeps=64, grid_nodes=1 << 15)  # fmt: skip
     zeros = torch.zeros(8, 3, dtype=F64)
-    sim.k.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
-    bound = law.bind(sim.k, 8, 1e-3)
+    sim.kernels.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
+    bound = law.bind(sim.kernels, 8, 1e-3)
     bound.forward(0, 8)
     bars = gradients(8, 1.0, seed=1), 1e-4 * gradients(8, 1.0, seed=2)
-    sim.k.gradient_bar.from_numpy(np.resize(bars[0].numpy(), (1024, 3, 3)))
-    sim.k.stress_bar.from_numpy(np.resize(bars[1].numpy(), (1024, 3, 3)))
+    sim.kernels.gradient_bar.from_numpy(np.resize(bars[0].numpy(), (1024, 3, 3)))
+    sim.kernels.stress_bar.from_numpy(np.resize(bars[1].numpy(), (1024, 3, 3)))
     bound.backward(0, 8)
     trial = f.clone().requires_grad_()
     out = law.project(trial, 1e-3)
     expected = torch.autograd.grad([out, law.stress(out)], [trial, *law.parameters()], bars, allow_unused=True)
-    ours = torch.as_tensor(sim.k.trial_bar.to_numpy()[:8])
+    ours = torch.as_tensor(sim.kernels.trial_bar.to_numpy()[:8])
     torch.testing.assert_close(ours, expected[0], rtol=1e-8, atol=1e-8 * float(expected[0].abs().max()))
     for mine, theirs in zip(bound.parameter_gradients(), expected[1:], strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=0)
@@ -344,7 +346,7 @@ def test_pretrained_sand_holds_a_slope_and_no_tension():
     assert torch.all((shares[1] > 0.6 * shares[0]) & (shares[1] < 1.3 * shares[0])), shares
 
 
-def test_departure_counts_every_strain_and_no_scale():
+def test_prior_distance_counts_every_strain_and_no_scale():
     law = NeuralLaw(seed=3).double()
     scaled, other = copy.deepcopy(law), copy.deepcopy(law)
     with torch.no_grad():
@@ -353,9 +355,9 @@ def test_departure_counts_every_strain_and_no_scale():
         scaled.log_bulk_ratio += 0.5
         scaled.log_flow_rate += 0.5
         other.elastic[-1].bias[2] += 0.5  # a bulk modulus e^0.5 times as large, at all strains
-    assert float(law.departure(law)) == float(scaled.departure(law)) == 0.0
-    assert float(other.departure(law)) == pytest.approx(0.5**2 / 4)
-    (slope,) = torch.autograd.grad(other.departure(law), other.elastic[-1].bias)
+    assert float(law.prior_distance(law)) == float(scaled.prior_distance(law)) == 0.0
+    assert float(other.prior_distance(law)) == pytest.approx(0.5**2 / 4)
+    (slope,) = torch.autograd.grad(other.prior_distance(law), other.elastic[-1].bias)
     torch.testing.assert_close(slope, torch.tensor([0.0, 0.0, 0.25, 0.0], dtype=torch.float64))
 
 

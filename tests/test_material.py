@@ -227,6 +227,7 @@ def test_what_cannot_be_told_apart_has_no_standard_error():
     assert all(s.excited and s.stderr_percent is None for s in found)
 
 
+@pytest.mark.slow
 def test_a_twin_is_described_with_errors_saved_and_reported(taichi, tmp_path):
     from test_simulate import twin
 

@@ -1,13 +1,15 @@
 """The simulator against physics, and its adjoint against a float64 twin and finite differences."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from masiv.effects.active import ActiveEffects, BoundEffects
-from masiv.errors import NonFiniteError
+from masiv.effects.active import ActiveEffects
+from masiv.effects.bound import BoundEffects
+from masiv.errors import InputError, NonFiniteError
 from masiv.identify.neural.starting_law import with_scales
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
@@ -15,7 +17,8 @@ from masiv.materials.neural import NeuralLaw
 from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm._reference import _substep
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.pretraining.pretrain import pretrained_path
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -173,7 +176,7 @@ def test_rollout_is_bit_reproducible_and_segments_do_not_change_it():
     start = State(*(t.float() for t in blob(200, height=0.05).tensors()))
     roomy = simulator(200, dtype=torch.float32, max_substeps=128)
     tight = simulator(200, dtype=torch.float32, memory_mb=7)  # a few dozen states at most
-    assert tight.k.capacity_steps < 100 <= roomy.k.capacity_steps
+    assert tight.kernels.capacity_steps < 100 <= roomy.kernels.capacity_steps
 
     def run(sim):
         x = start.position.clone().requires_grad_()
@@ -192,9 +195,9 @@ def test_substeps_launched_at_once_and_one_by_one_and_in_parts_are_the_same(monk
     law, nothing = elastic(), ActiveEffects((), None)
     ends = []
     for serial in (10**6, 0):
-        monkeypatch.setattr("masiv.mpm.simulator.SERIAL", serial)
+        monkeypatch.setattr("masiv.mpm.taped_rollout.SERIAL_PARTICLES", serial)
         ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
-    monkeypatch.setattr(BoundEffects, "none", False)  # launch by launch, as with effects
+    monkeypatch.setattr(BoundEffects, "empty", False)  # launch by launch, as with effects
     ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
     for end in ends[1:]:
         np.testing.assert_allclose(end.numpy(), ends[0].numpy(), atol=1e-6)
@@ -226,3 +229,32 @@ def test_divergence_names_substep_and_particle():
     fast.velocity[:] = 100.0
     with pytest.raises(NonFiniteError, match="substep 0"):
         simulator(60).run(fast, elastic(), 8, [8])
+
+
+def test_shapes_are_checked_before_taichi_sees_them():
+    sim, start = simulator(60), blob(60)
+    with pytest.raises(InputError, match="velocity has shape \\(59, 3\\), the simulator needs \\(60, 3\\)"):
+        sim.run(replace(start, velocity=start.velocity[1:]), elastic(), 8, [8])
+    with pytest.raises(InputError, match="ascending substeps from 0 to 8"):
+        sim.run(start, elastic(), 8, [9])
+    with pytest.raises(InputError, match="at least 1"):
+        sim.run(start, elastic(), 0, [])
+    with pytest.raises(InputError, match="gravity"):
+        simulator(60, gravity=(0.0, -9.8))
+    with pytest.raises(InputError, match="unknown contact 'glue'"):
+        simulator(60, contact="glue")
+    with pytest.raises(InputError, match="density = -1"):
+        simulator(60, density=-1.0)
+
+
+def test_memory_counts_states_and_grids():
+    """Of a simulator with room for as many substeps as memory allows, both together stay within it."""
+    k = simulator(200, dtype=torch.float32, memory_mb=6, max_substeps=1 << 14).kernels
+    state = sum(
+        int(np.prod(field.shape[1:])) * field.n * field.m
+        for field in (k.position, k.velocity, k.affine_velocity, k.trial_gradient, k.deformation_gradient,
+                      k.kirchhoff_stress)
+    )  # fmt: skip
+    log = 4 * (k.capacity_log - k.capacity_nodes) / k.capacity_steps
+    kept = 4 * k.capacity_steps * (state + log)
+    assert 3e6 < kept <= 6e6

@@ -15,14 +15,14 @@ from masiv.scene.camera import Camera
 from masiv.scene.scene import Frame, Scene
 from masiv.splat._reference import _render
 from masiv.splat.config import ReconstructConfig
+from masiv.splat.data_parallel import GradientWorker
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.losses import neighbour_pairs, ssim, strain
-from masiv.splat.objective import NAMES, Objective, Part
+from masiv.splat.objective import PARAMETER_NAMES, Objective, Part
 from masiv.splat.observed_image import observed_image
 from masiv.splat.rasteriser import render
 from masiv.splat.reconstruct import reconstruct
-from masiv.splat.share import Second
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -37,8 +37,8 @@ CONFIG = ReconstructConfig(
     depth=1,
     space_octaves=1,
     iterations=260,
-    first_frame_share=0.4,
-    growth_share=0.3,
+    first_frame_fraction=0.4,
+    growth_fraction=0.3,
     processes=1,
 )
 
@@ -120,6 +120,7 @@ def result(scene, tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_material_points_are_followed(result):
     unit, _ = ball()
     start = torch.tensor(truth(unit, 0)).float()
@@ -133,6 +134,7 @@ def test_material_points_are_followed(result):
         assert frame < 3 or error < 0.8 * np.linalg.norm(expected - expected.mean(axis=0), axis=1).mean()
 
 
+@pytest.mark.slow
 def test_a_spin_that_no_outline_shows_is_followed():
     """From the first frame on: where points or colours may slide over the surface, half of it is lost there."""
     found = reconstruct(filmed(spun), CONFIG, seed=4, checkpoint=Checkpoint(None), progress=silent)
@@ -144,6 +146,7 @@ def test_a_spin_that_no_outline_shows_is_followed():
     assert np.linalg.norm(turn - SPIN) < 0.3 * np.linalg.norm(SPIN)
 
 
+@pytest.mark.slow
 def test_a_view_held_out_is_predicted(scene, result):
     for frame in (0, 3):
         picture, camera = scene.frame(3, frame), scene.cameras[3]
@@ -155,6 +158,7 @@ def test_a_view_held_out_is_predicted(scene, result):
         assert -10 * np.log10(((drawn - target)[box] ** 2).mean()) > 20, frame
 
 
+@pytest.mark.slow
 def test_resumed_run_ends_with_the_same_numbers(scene, result, tmp_path):
     part = scene.restricted(holdout_cameras=(3,))
     checkpoint = Checkpoint(tmp_path / "state.pt", every_s=0.0)
@@ -202,20 +206,21 @@ def test_two_processes_end_with_the_numbers_of_one(scene, tmp_path):
     assert same(whole, reconstruct(scene, two, seed=4, checkpoint=Checkpoint(None), progress=silent))
 
 
+@pytest.mark.slow
 def test_a_second_process_that_dies_is_told_of_and_none_is_left(scene, monkeypatch):
     started = []
 
-    class Dies(Second):
+    class Dies(GradientWorker):
         def __init__(self):
             super().__init__()
             started.append(self._process)
 
-        def begin(self, *given):
+        def submit(self, *given):
             if len(started) == 1:
                 started.append(self._process.kill())
-            super().begin(*given)
+            super().submit(*given)
 
-    monkeypatch.setattr("masiv.splat.reconstruct.Second", Dies)
+    monkeypatch.setattr("masiv.splat.reconstruct.GradientWorker", Dies)
     config = CONFIG.model_copy(update={"iterations": 5, "processes": 2})
     with pytest.raises(MasivError, match=r"set reconstruct\.processes to 1"):
         reconstruct(scene, config, seed=4, checkpoint=Checkpoint(None), progress=silent)
@@ -227,19 +232,19 @@ def test_what_the_second_process_cannot_draw_is_told_of(scene):
     nowhere = dataclasses.replace(scene.cameras[0], world_to_camera=np.full((4, 4), np.nan))
     seen = dataclasses.replace(observed_image(scene, 0, 0, crop_side=40, crop_padding=4), camera=nowhere)
     objective = Objective(CONFIG, 0.01, 0.2, FPS, None, (), [[seen]])
-    gaussians = {n: torch.zeros(4, *s) for n, s in zip(NAMES, ((3,), (), (), (3,)), strict=True)}
+    gaussians = {n: torch.zeros(4, *s) for n, s in zip(PARAMETER_NAMES, ((3,), (), (), (3,)), strict=True)}
     network = DeformationNetwork(
         centre=torch.zeros(3), half_extent=0.2, frame_count=2, fps=FPS, base_motion=torch.zeros(2, 3)
     )
     pairs = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long)
-    part = Part(((0, 0, np.zeros(3)),), 1, (0,), 1, None, sizes=True)
-    with Second() as second:
-        second.give(objective, network, 4)
+    part = Part(((0, 0, np.zeros(3)),), 1, (0,), 1, None, scale_term=True)
+    with GradientWorker() as worker:
+        worker.configure(objective, network, 4)
         for _ in range(2):  # it goes on
-            second.begin(gaussians, network, pairs, part)
+            worker.submit(gaussians, network, pairs, part)
             with pytest.raises(MasivError, match="not finite"):
-                second.end()
-        process = second._process
+                worker.result()
+        process = worker._process
     assert process.returncode == 0
 
 

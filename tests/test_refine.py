@@ -11,7 +11,7 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
 from masiv.inference.model_fit import clipped_step
@@ -82,6 +82,7 @@ def found(*motions, **settings):
     return refined, summary(refined, config, dry_run=False)
 
 
+@pytest.mark.slow
 def test_undeclared_drag_is_named_measured_and_confirmed():
     refined, document = found(observed({"linear_drag": [1.0]}))
     assert document["verdict"] == "effect added"
@@ -94,6 +95,7 @@ def test_undeclared_drag_is_named_measured_and_confirmed():
     assert refined.result.after.values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
 
 
+@pytest.mark.slow
 def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
     other = observed({"body_force": [0.0, 0.0, 2.0]}, velocity=(-0.5, 1.0, 1.0), omega=(0.0, -2.0, 1.0))
     refined, document = found(
@@ -113,6 +115,7 @@ def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
         found(other, effects=["ether"])
 
 
+@pytest.mark.slow
 def test_a_second_cause_is_seen_beside_one_that_took_it_over():
     pair = {"body_force": [1.5, 0.0, -1.0], "linear_drag": [0.7]}
     _, document = found(
@@ -127,6 +130,7 @@ def test_a_second_cause_is_seen_beside_one_that_took_it_over():
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_nothing_is_missing_where_nothing_is():
     _, document = found(observed({}))
     assert document["verdict"] == "nothing missing"

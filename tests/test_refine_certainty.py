@@ -62,6 +62,7 @@ def found(noise, pattern, strength):
     return fitted, SimpleNamespace(strengths=(parameters[-1],), others=())
 
 
+@pytest.mark.slow
 def test_lengths_are_those_of_the_noise_though_a_fit_took_its_smoothest_part():
     more = [TIMES[:, None, None] ** n * axis for n in (0, 2) for axis in np.eye(3)]
     jacobian = fields_of(*initial_motion(), *more, *[m * PLACES[:, k, None] for m in more for k in range(3)])
@@ -78,7 +79,7 @@ def test_lengths_are_those_of_the_noise_though_a_fit_took_its_smoothest_part():
     assert smoothness(np.ones((2, POINTS, 3)), np.zeros((2, POINTS, 3, 0)), PLACES) is None
 
 
-@pytest.mark.parametrize("pattern", [SMOOTH, ROUGH], ids=["smooth", "rough"])
+@pytest.mark.parametrize("pattern", [SMOOTH, pytest.param(ROUGH, marks=pytest.mark.slow)], ids=["smooth", "rough"])
 def test_noise_alone_is_as_certain_as_chance_has_it(pattern):
     sigmas = [wald_z_gls(*found(noise, pattern, 0.0), WATCHED) for noise in noises(60, seed=2)]
     assert np.mean(np.square(sigmas)) == pytest.approx(1.0, rel=0.6)
@@ -98,6 +99,7 @@ def rivals(noise, patterns, strengths):
 BOTH = SMOOTH, (TIMES**2)[:, None, None] * np.array([3e-3, 0.0, 0.0]) * (1 + 3 * PLACES[:, :1])
 
 
+@pytest.mark.slow
 def test_of_two_causes_that_are_as_near_to_the_truth_chance_decides():
     fits = [rivals(noise, BOTH, (0.0, 0.0)) for noise in noises(40, seed=5)]
     sigmas = [vuong_z(*fit, WATCHED) for fit in fits]

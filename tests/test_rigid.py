@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.observations.noise_floor import noise_floor
 from masiv.rigid import ballistic_positions, beyond_rigid, beyond_uniform, free_flight, impact_point, turned_freely
 

@@ -123,6 +123,19 @@ def test_a_run_made_before_a_key_existed_opens(tmp_path):
         RunFolder.create_or_resume(path, request(tmp_path, reconstruct__iterations=7))
 
 
+def test_a_run_of_an_earlier_version_is_resumed(tmp_path):
+    """Its keys have older names."""
+    run = RunFolder.create_or_resume(tmp_path / "run", request(tmp_path))
+    with run.stage("reconstruct"):
+        pass
+    record = yaml.safe_load((run.path / "run.yaml").read_text())
+    values = record["config"]["reconstruct"]
+    values["pictures"] = values.pop("batch_size")
+    (run.path / "run.yaml").write_text(yaml.safe_dump(record))
+    assert RunFolder.open(run.path).config == run.config
+    assert RunFolder.create_or_resume(run.path, request(tmp_path)).done("reconstruct")
+
+
 def test_a_folder_with_something_else_is_left_alone(tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/cat.jpg").write_text("cat")

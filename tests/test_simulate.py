@@ -169,7 +169,7 @@ def test_a_blend_rolls_out_as_its_definition_and_between_its_ends():
     height = [np.ptp(p[..., 1], axis=1).min() for p in (*ends, run(blend(jelly, water, 0.5)))]
     assert height[1] < height[2] < height[0]
     with pytest.raises(MasivError, match="no adjoint"):
-        BlendedLaw(jelly, water, 0.5).bind(simulator().k, 8, 1e-3).backward(0, 8)
+        BlendedLaw(jelly, water, 0.5).bind(simulator().kernels, 8, 1e-3).backward(0, 8)
 
 
 def simulator():

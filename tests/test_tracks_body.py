@@ -146,6 +146,7 @@ def test_clamp_holds_against_effects_and_has_no_part_in_gradients(taichi):
     assert rate.grad.item() == pytest.approx(slope.item(), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_cantilever_swings_with_its_frequency_and_is_read_back(taichi, tmp_path):
     """A synthetic twin of a measured beam: two grids, both near Timoshenko's frequency, the finer one nearer."""
     law = ClassicalLaw("neo_hookean", youngs_modulus=264e3, poissons_ratio=0.0001)

@@ -102,6 +102,7 @@ def bar(tmp_path_factory):
     return read_tracks(write_bar(tmp_path_factory.mktemp("bar"), runs))
 
 
+@pytest.mark.slow
 def test_damping_is_found_and_the_law_with_it(bar):
     known = {"poissons_ratio": RATIO}
     simulation = only(
@@ -121,6 +122,7 @@ def test_damping_is_found_and_the_law_with_it(bar):
     assert all(any("it takes a medium of" in reason for reason in t.reasons) for t in drag)
 
 
+@pytest.mark.slow
 def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
     simulation = only(simulation_of(bar, "load", TRACKS, SIMULATOR, known=known), ("point_mass", "gravity_scale"))
@@ -186,6 +188,7 @@ def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
     assert gauss_newton_fit(simulation, model, {}, budget=4).fit_mm < 0.1
 
 
+@pytest.mark.slow
 def test_load_is_found_where_the_release_is_not_seen(bar):
     """Out of phase, and with no first moments to count from: from none, its derivative would lead elsewhere."""
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}

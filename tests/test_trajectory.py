@@ -10,7 +10,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.consistency import consistent_particles
 from masiv.continuum.fill import FilledVolume
-from masiv.continuum.finetune import match
+from masiv.continuum.finetune import chamfer_targets
 from masiv.continuum.losses import below_ground, field_terms, load_views, outside_of_mask, stencil
 from masiv.continuum.trajectory import Trajectory, estimate_trajectory
 from masiv.errors import InputError
@@ -18,7 +18,13 @@ from masiv.scene.scene import Ground
 
 RADIUS, SHIFT = 0.22, np.array([0.06, -0.02, 0.03])
 CONFIG = TrajectoryConfig(
-    particle_count=600, fill_resolution=32, iterations=60, learning_rate=1e-2, batch=300, match_every=5, motion_weight=0
+    particle_count=600,
+    fill_resolution=32,
+    iterations=60,
+    learning_rate=1e-2,
+    batch_size=300,
+    match_interval=5,
+    motion_weight=0,
 )
 
 
@@ -66,7 +72,7 @@ def test_a_missed_motion_is_found(scene, dynamic, monkeypatch):
 
 
 def test_first_frame_is_anchored_and_frames_agree_with_evaluate(scene, dynamic):
-    result = estimate_trajectory(scene, dynamic, CONFIG.model_copy(update={"carve_misses": 99, "iterations": 5}))
+    result = estimate_trajectory(scene, dynamic, CONFIG.model_copy(update={"carve_images": 99, "iterations": 5}))
     np.testing.assert_array_equal(result.evaluate(np.array([0.0]))[0], result.positions[0])
     np.testing.assert_allclose(result.evaluate(result.times), result.positions, atol=1e-6)
     between = result.evaluate(np.linspace(0, result.times[-1], 31))
@@ -74,7 +80,7 @@ def test_first_frame_is_anchored_and_frames_agree_with_evaluate(scene, dynamic):
 
 
 def test_interrupted_and_resumed_is_uninterrupted(scene, dynamic, tmp_path):
-    config = CONFIG.model_copy(update={"carve_misses": 99, "iterations": 20})
+    config = CONFIG.model_copy(update={"carve_images": 99, "iterations": 20})
     whole = estimate_trajectory(scene, dynamic, config, seed=3)
 
     class Killed(Exception):
@@ -95,7 +101,7 @@ def test_interrupted_and_resumed_is_uninterrupted(scene, dynamic, tmp_path):
 
 
 def test_saved_trajectory_evaluates_alone(scene, dynamic, tmp_path):
-    result = estimate_trajectory(scene, dynamic, CONFIG.model_copy(update={"carve_misses": 99, "iterations": 10}))
+    result = estimate_trajectory(scene, dynamic, CONFIG.model_copy(update={"carve_images": 99, "iterations": 10}))
     result.save(tmp_path / "trajectory.npz")
     loaded = Trajectory.load(tmp_path / "trajectory.npz")
     times = np.array([0.01, 0.055])
@@ -107,30 +113,30 @@ def test_saved_trajectory_evaluates_alone(scene, dynamic, tmp_path):
         Trajectory.load(tmp_path / "broken.npz")
 
 
-def test_matches_have_the_gradient_of_chamfer():
+def test_targets_have_the_gradient_of_chamfer():
     """Against autograd through the Chamfer distance itself, pairs all farther than the sampling noise."""
     rng = np.random.default_rng(0)
     moved, target = rng.normal(size=(1, 30, 3)), rng.normal(size=(20, 3)) + 4.0
     start = FilledVolume(moved[0], 1e-3, 1.0)
-    matches = match(moved, [FilledVolume(target, 1e-3, 1.0)], start)
+    targets = chamfer_targets(moved, [FilledVolume(target, 1e-3, 1.0)], start)
     x = torch.tensor(moved[0], requires_grad=True)
     square = torch.cdist(x, torch.tensor(target)).square()
     (square.min(1).values.mean() + square.min(0).values.mean()).backward()
-    ours = 2 * matches.weights[0][:, None].double() * (torch.tensor(moved[0]) - matches.targets[0].double())
+    ours = 2 * targets.weights[0][:, None].double() * (torch.tensor(moved[0]) - targets.targets[0].double())
     torch.testing.assert_close(ours, x.grad, rtol=1e-4, atol=1e-6)
 
 
 def test_a_second_sampling_of_the_same_volume_does_not_pull():
     start = FilledVolume(lattice(), 0.1, 216e-3)
     shifted = FilledVolume(lattice() + 0.03, 0.1, 216e-3)
-    assert float(match(lattice()[None], [shifted], start).weights.sum()) == 0
+    assert float(chamfer_targets(lattice()[None], [shifted], start).weights.sum()) == 0
 
 
 def test_hull_that_no_camera_sees_does_not_pull():
     """A filled volume twice the body's: of the half that is far away, the tenth that is slack pulls and no more."""
     start = FilledVolume(lattice(), 0.1, 216e-3)
     spike = np.concatenate([lattice(), lattice() + np.array([3.0, 0, 0])])
-    assert float(match(lattice()[None], [FilledVolume(spike, 0.1, 432e-3)], start).weights.sum()) < 0.11 / 2
+    assert float(chamfer_targets(lattice()[None], [FilledVolume(spike, 0.1, 432e-3)], start).weights.sum()) < 0.11 / 2
 
 
 @pytest.mark.parametrize("kind", ["translation", "rotation", "stretch"])
@@ -175,6 +181,6 @@ def test_what_leaves_the_masks_or_the_world_is_carved(scene, dynamic):
     centre = moving(0)[0][0]
     along = SHIFT / np.linalg.norm(SHIFT)
     probes = np.stack([centre - 0.18 * along, centre + 0.1 * along])
-    config = CONFIG.model_copy(update={"carve_tolerance": 1.5, "carve_misses": 3})
+    config = CONFIG.model_copy(update={"carve_tolerance": 1.5, "carve_images": 3})
     kept = consistent_particles(scene, dynamic.deformation, probes, config)
     assert kept.tolist() == [False, True]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from masiv.effects.catalogue import effects
-from masiv.effects.effect import DragBody
+from masiv.effects.per_body import DragBody
 from masiv.errors import InputError
 from masiv.materials.classical import PARAMETERS, RANGES, ClassicalLaw
 from masiv.mpm.config import SimulatorConfig
@@ -65,7 +65,7 @@ def bodies(draw, name):
 @st.composite
 def twin_effects(draw, of):
     effect = draw(st.sampled_from(list(effects().values())))
-    parameters = effect.shared if effect.shared and draw(st.booleans()) else effect.parameters
+    parameters = effect.per_body.parameters if effect.per_body and draw(st.booleans()) else effect.parameters
     values = {p.name: draw(st.floats(p.lower, p.upper)) for p in parameters}
     stderr = {p.name: draw(st.none() | st.floats(0, 1e6)) for p in parameters}
     place = tuple(draw(vectors).tolist()) if draw(st.booleans()) else None

@@ -134,7 +134,7 @@ def test_a_push_moves_what_is_added_to_the_mass_too():
     assert body_mass(replace(heavy, effects=())) == pytest.approx(27)
     path = simulate(heavy, frames=6, force=ForcePulse(np.array([81.0, 0, 0]))).positions
     held = heavy.positions.astype(float)
-    radius = active_effects(heavy, frames=2, fps=FPS).setting.size / 8
+    radius = active_effects(heavy, frames=2, fps=FPS).context.size / 8
     share = np.exp(-0.5 * ((held - held.mean(0)) ** 2).sum(1) / radius**2)
     weight = 27 / len(held) + 13.5 * share / share.sum()
     centre = (path[:, :, 0] * weight).sum(1) / weight.sum()

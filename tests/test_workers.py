@@ -6,6 +6,8 @@ import dataclasses
 import multiprocessing
 import os
 import pickle
+import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -31,7 +33,7 @@ from masiv.refine.baselines import DONE, baselines, derived
 from masiv.refine.config import RefineConfig
 from masiv.refine.prepare import prepare
 from masiv.refine.tasks import map_tasks, ranked
-from masiv.workers import TaskError, Workers, processes_wanted, unwrap
+from masiv.workers import TaskError, Workers, process_count, unwrap
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -63,6 +65,43 @@ def threads():
 def raised_by_one(tensor):
     tensor += 1.0
     return tensor
+
+
+class CountsPickles:
+    """Counts how often it is pickled in this process."""
+
+    pickles = 0
+
+    def __init__(self, value):
+        self.value = value
+
+    def __reduce__(self):
+        CountsPickles.pickles += 1
+        return CountsPickles, (self.value,)
+
+
+def changed(shared, step):
+    """What it is given, changed by this task only."""
+    shared.value += step
+    return shared.value
+
+
+def writes_late(folder):
+    (folder / f"started {os.getpid()}").touch()
+    time.sleep(30)
+    (folder / f"finished {os.getpid()}").touch()
+
+
+PUTENV = []
+"""Names of environment variables that this process sets while a test listens."""
+
+
+def _listen(event, arguments):
+    if event == "os.putenv" and PUTENV:
+        PUTENV.append(os.fsdecode(arguments[0]))
+
+
+sys.addaudithook(_listen)
 
 
 def quiet(*_):
@@ -113,6 +152,43 @@ def test_each_process_runs_on_one_thread_and_this_one_as_before(two):
     assert dict(os.environ) == before
 
 
+def test_the_environment_of_this_process_is_never_changed():
+    """Not even for a moment: another thread may read it, or start a process of its own."""
+    PUTENV.append("listening")
+    try:
+        with Workers(2) as workers:
+            assert set(workers.map(threads, [()] * 2)) == {(1, "1")}
+        assert PUTENV == ["listening"]
+    finally:
+        PUTENV.clear()
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_shared_arguments_are_pickled_once(processes):
+    with Workers(processes) as workers:
+        CountsPickles.pickles = 0
+        shared = CountsPickles(10)
+        found = list(workers.map(changed, [(k,) for k in range(6)], shared=(shared,)))
+        assert CountsPickles.pickles == (1 if processes > 1 else 0)
+        if processes > 1:  # each task has a copy of its own
+            assert found == [10, 11, 12, 13, 14, 15]
+            assert shared.value == 10
+
+
+def test_an_error_does_not_wait_for_running_tasks(tmp_path):
+    def fail():
+        with Workers(2) as workers:
+            for _ in range(2):
+                workers.submit(writes_late, (tmp_path,))
+            while len(list(tmp_path.glob("started *"))) < 2:
+                time.sleep(0.05)
+            raise MasivError("elsewhere")
+
+    with pytest.raises(MasivError, match="elsewhere"):
+        fail()
+    assert not list(tmp_path.glob("finished *"))
+
+
 def test_a_process_that_dies_is_told_of():
     with Workers(2, "identify.processes") as workers, pytest.raises(MasivError, match=r"set identify\.processes to 1"):
         list(workers.map(dies, [(), ()]))
@@ -130,15 +206,16 @@ def test_a_task_beside_this_process(processes):
 def test_processes_begin_before_they_are_asked_for_anything(processes):
     before = len(multiprocessing.active_children())
     with Workers(processes) as workers:
-        workers.begin()
+        workers.start()
         assert (len(multiprocessing.active_children()) > before) == (processes > 1)
 
 
 def test_as_many_as_asked_or_as_there_are_cores():
-    assert processes_wanted(3) == 3
-    assert 1 <= processes_wanted(0) <= 4
+    assert process_count(3) == 3
+    assert 1 <= process_count(0) <= 4
 
 
+@pytest.mark.slow
 def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.identify.neural.starting_law.START_MODULI", (1e4, 3e4))
     monkeypatch.setattr("masiv.identify.neural.starting_law.SEARCHED_MATERIALS", 2)
@@ -191,6 +268,7 @@ def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
     assert fitted.model.contact == "sticky"
 
 
+@pytest.mark.slow
 def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
     simulation, _ = small_simulation()

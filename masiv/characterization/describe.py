@@ -12,6 +12,7 @@ import numpy as np
 from masiv.characterization import curves
 from masiv.characterization.excitation import Excited, Sensitivity, excited_range, sensitivities
 from masiv.characterization.families import Match, nearest_families
+from masiv.files import write_json
 from masiv.materials.law import Law
 from masiv.progress import Progress, silent
 from masiv.subsample import kd_tree_subset
@@ -60,7 +61,6 @@ class Material:
 
     def save(self, path: Path) -> None:
         """Write ``path`` (.json), complete or not at all."""
-        from masiv.files import write_json
 
         write_json(path, self.as_data())
 
@@ -242,7 +242,7 @@ def _yield(law: Law, kind: str, strain: float, dt: float) -> tuple[Quantity, boo
 
 
 def _friction(law: Law, log_volume: float, strain: float, dt: float) -> Quantity:
-    """From |tau_dev| = 3 alpha p in shear under pressure, alpha as of ``masiv.kernels.tensor.drucker_prager``."""
+    """From |tau_dev| = 3 alpha p in shear under pressure, alpha as of ``masiv.kernels.laws.drucker_prager``."""
     amounts = math.sqrt(3) * strain * np.arange(1, POINTS + 1) / POINTS
     stress = curves.drive(law, curves.simple_shear(amounts, log_volume)[:, None], dt)[1][-1, 0]
     pressure = -float(stress.trace()) / 3

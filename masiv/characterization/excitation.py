@@ -19,7 +19,7 @@ from masiv.materials.law import Law
 from masiv.materials.neural import NeuralLaw
 
 if TYPE_CHECKING:
-    from masiv.mpm.simulator import State
+    from masiv.mpm.state import State
 
 NEIGHBOURS, SAMPLE = 12, 1500
 STEP = 1.1

@@ -1,4 +1,4 @@
-"""Carving across time: what belongs to the object stays in its masks and above the ground in every frame."""
+"""Carving over time: a point of the object stays inside the masks and above the ground in every frame."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from masiv.splat.deformation import DeformationNetwork
 def consistent_particles(
     scene: Scene, network: DeformationNetwork, points: np.ndarray, config: TrajectoryConfig
 ) -> np.ndarray:
-    """Which frame-0 points (M, 3) [m] their motion keeps inside of the object, (M,) bool.
+    """Which frame-0 points (M, 3) [m] stay inside the masks while they move, (M,) bool.
 
-    A picture (view and frame) counts against a point that it shows more than ``config.carve_tolerance`` pixels outside
-    of the mask, and a frame that carries it as far below the ground counts as all its views. ``config.carve_misses``
-    such pictures remove it. The tolerance is there because the motion is a first estimate.
+    An image (view and frame) counts against a point that it shows more than ``config.carve_tolerance`` pixels outside
+    of its mask. A frame at which a point is as far below the ground counts as all its views. A point is removed if
+    ``config.carve_images`` images count against it. The tolerance allows for errors of the motion, a first estimate.
     """
-    misses = np.zeros(len(points), np.int32)
+    against = np.zeros(len(points), np.int32)
     start = torch.as_tensor(points, dtype=torch.float32)
     for frame in range(scene.frame_count):
         with torch.no_grad():
@@ -28,11 +28,11 @@ def consistent_particles(
         views = silhouettes(scene, frame)
         pixel = np.inf
         for view in views:
-            distance, _, judged = view.outside(moved)
+            distance, _, visible = view.distances(moved)
             width = np.median(view.camera.project(moved)[1]) / view.camera.intrinsics[0, 0]
-            misses += judged & (distance > config.carve_tolerance * width)
+            against += visible & (distance > config.carve_tolerance * width)
             pixel = min(pixel, width)
         if scene.ground is not None:
             below = scene.ground.height - moved @ scene.ground.normal
-            misses += len(views) * (below > config.carve_tolerance * pixel)
-    return misses < config.carve_misses
+            against += len(views) * (below > config.carve_tolerance * pixel)
+    return against < config.carve_images

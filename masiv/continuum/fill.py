@@ -1,6 +1,6 @@
-"""The solid continuum of one frame: what silhouettes and rendered surfaces leave, filled with evenly spread particles.
+"""The solid continuum of one frame: the visual hull behind the rendered surface, filled with evenly spaced particles.
 
-After the filling of GIC (Cai et al. 2024), which MASIV's section "Continuum Trajectory Estimation" follows, with the
+Follows the filling of GIC (Cai et al. 2024), as MASIV does (section "Continuum Trajectory Estimation"), with the visual
 hull in place of opacity seeds: candidates inside every silhouette and behind the rendered surface, a mean filter and a
 threshold.
 """
@@ -8,24 +8,23 @@ threshold.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from scipy import ndimage
 
 from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import MasivError
 from masiv.hull.carve import visual_hull
-from masiv.hull.settle import settled_hull
+from masiv.hull.shadow_volume import remove_shadow_volume
 from masiv.hull.silhouette import sample_bilinear, silhouettes
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
-
-if TYPE_CHECKING:
-    from masiv.splat.dynamic import DynamicGaussians
+from masiv.splat.dynamic import DynamicGaussians
+from masiv.splat.rasteriser import render
 
 _SMALLEST_PIECE = 0.1
-"""Pieces below this share of the largest one are dust of the masks."""
+"""Connected pieces smaller than this fraction of the largest one are noise of the masks."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,8 @@ def fill_volume(
 ) -> FilledVolume:
     """Fill the object of ``frame`` with about ``config.particle_count`` particles, or with the given ``spacing`` [m].
 
-    volume [m³]: of the object's hull at frame 0, where it is known: see ``settled_hull``.
-    Without ``dynamic`` only the silhouettes carve. Raises MasivError where nothing is left of the object.
+    volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``. Without ``dynamic`` only the
+    silhouettes carve. Raises MasivError if nothing is left of the object or it is thinner than ``spacing``.
     """
     field = density_field(scene, dynamic, frame, config, volume=volume)
     if spacing is None:
@@ -93,13 +92,13 @@ def density_field(
     *,
     volume: float | None = None,
 ) -> DensityField:
-    """Carve ``frame`` by its silhouettes and, with ``dynamic``, by the depth of the rendered surface; clean it.
+    """Carve ``frame`` by its silhouettes and, with ``dynamic``, by the depth of the rendered surface; smooth it.
 
-    With ``volume`` [m³], that of the hull at frame 0, the hull is settled first.
+    volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``.
     """
     hull = visual_hull(scene, frame, resolution=config.fill_resolution)
     if volume is not None:
-        hull = settled_hull(scene, frame, hull, volume)
+        hull = remove_shadow_volume(scene, frame, hull, volume)
     spacing = hull.spacing
     margin = 2
     lower = hull.points.min(axis=0) - margin * spacing
@@ -107,9 +106,9 @@ def density_field(
     density = np.zeros(index.max(axis=0) + 1 + margin, np.float32)
     outside = np.full(len(hull.points), -np.inf)
     for view in silhouettes(scene, frame):
-        distance, _, judged = view.outside(hull.points)
-        outside = np.maximum(outside, np.where(judged, distance, -np.inf))
-    # A voxel cut by a silhouette's edge counts by the part that is inside.
+        distance, _, visible = view.distances(hull.points)
+        outside = np.maximum(outside, np.where(visible, distance, -np.inf))
+    # A voxel at the edge of a silhouette has the density of the part that is inside.
     filled = np.clip(0.5 - outside / spacing, 0.0, 1.0)
     if dynamic is not None:
         filled[in_front_of_surface(scene, dynamic, frame, hull.points, config.depth_tolerance * spacing)] = 0.0
@@ -124,12 +123,12 @@ def density_field(
 def in_front_of_surface(
     scene: Scene, dynamic: DynamicGaussians, frame: int, points: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """Points (N, 3) [m] that two views or more see to be empty: nearer than the opaque surface by ``tolerance`` [m]."""
+    """Which points (N, 3) [m] two views or more show to be empty: nearer than the surface by ``tolerance`` [m]."""
     votes = np.zeros(len(points), np.int32)
     for view in scene.views:
         camera = scene.cameras[view]
         depth = surface_depth(dynamic, camera, frame / scene.fps)
-        # The nearest of 3 x 3 pixels: at an edge the mean depth of a pixel mixes object and void.
+        # The smallest of 3 x 3 pixels: at an edge the depth of a pixel is a mean over object and background.
         depth = ndimage.minimum_filter(depth, size=3, mode="nearest")
         pixels, along = camera.project(points)
         shown = (along > 0) & (pixels >= 0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
@@ -138,9 +137,9 @@ def in_front_of_surface(
 
 
 def even_points(field: DensityField, spacing: float) -> np.ndarray:
-    """Body-centred cubic lattice points (M, 3) [m] inside ``field``, spacing³ of volume each.
+    """Points (M, 3) [m] of a body-centred cubic lattice inside ``field``, one for each spacing³ of volume.
 
-    The body-centred lattice leaves the smallest gaps for its count, and no plane of it is as sparse as a cubic one's.
+    For a given number of points this lattice leaves smaller gaps than a simple cubic one.
     """
     cell = spacing * 2 ** (1 / 3)
     solid = np.argwhere(field.density > 0.5)
@@ -153,7 +152,7 @@ def even_points(field: DensityField, spacing: float) -> np.ndarray:
 
 
 def _main_pieces(solid: np.ndarray) -> np.ndarray:
-    """The connected pieces of (I, J, K) bool that are not dust."""
+    """The connected pieces of ``solid`` (I, J, K) bool that are not noise."""
     labels, _ = ndimage.label(solid)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
@@ -161,12 +160,7 @@ def _main_pieces(solid: np.ndarray) -> np.ndarray:
 
 
 def surface_depth(dynamic: DynamicGaussians, camera: Camera, time: float) -> np.ndarray:
-    """Depth (H, W) [m] of the Gaussians that ``camera`` sees at ``time`` [s]; where they are not opaque 0, which rules
-    nothing out."""
-    import torch
-
-    from masiv.splat.rasteriser import render
-
+    """Depth (H, W) [m] of the Gaussians in ``camera`` at ``time`` [s]; 0, which carves nothing, if not opaque."""
     with torch.no_grad():
         g = dynamic.at(time)
         picture = render(camera, g.means, g.scales, g.opacities, g.colours, torch.zeros(3))

@@ -1,4 +1,4 @@
-"""What a motion of the continuum must answer to. All are means of squares, lengths in particle spacings."""
+"""Terms of the loss of a continuum's motion: silhouettes, ground, smoothness, volume and rigidity."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from masiv.hull.silhouette import silhouettes
 from masiv.scene.scene import Ground, Scene
 
 _LARGEST_SIDE = 256
-"""Signed distances are smooth: larger pictures are reduced to this many pixels."""
+"""Pixels along the longer side of a distance field. Larger ones are reduced: signed distances are smooth."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One mask for torch: distance (H, W) [pixels] to its edge, pose (3, 4) and pinhole (3, 3)."""
+    """One mask as tensors: signed distance (H, W) [pixels] to its edge, pose (3, 4) [m] and pinhole (3, 3) [pixels]."""
 
     distance: torch.Tensor
     pose: torch.Tensor
@@ -26,12 +26,12 @@ class View:
 
 
 def load_views(scene: Scene) -> list[list[View]]:
-    """The masks that ``scene`` may look at, as a list over frames of lists over views."""
+    """The masks of all views that are not held out: a list over frames of lists over views."""
     return [[_view(s) for s in silhouettes(scene, frame)] for frame in range(scene.frame_count)]
 
 
 def _view(silhouette) -> View:
-    # Where an occluder hides the scene the mask rules nothing out.
+    # The mask says nothing about pixels that an occluder hides.
     distance = np.where(silhouette.valid, silhouette.distance, np.minimum(silhouette.distance, 0.0)).astype(np.float32)
     height, width = distance.shape
     factor = math.ceil(max(height, width) / _LARGEST_SIDE)
@@ -46,7 +46,7 @@ def _view(silhouette) -> View:
 
 
 def outside_of_mask(positions: torch.Tensor, view: View) -> torch.Tensor:
-    """World points (N, 3) [m] -> how far outside of the mask (N,) [m], 0 inside it or out of the picture."""
+    """World points (N, 3) [m] -> distance outside of the mask (N,) [m], 0 inside of it or outside of the image."""
     in_camera = positions @ view.pose[:, :3].T + view.pose[:, 3]
     depth = in_camera[:, 2].clamp(min=1e-3)
     pixels = (in_camera @ view.pinhole.T)[:, :2] / depth[:, None]
@@ -74,7 +74,8 @@ def stencil(centres: torch.Tensor, step: float) -> torch.Tensor:
 def field_terms(displacements: torch.Tensor, step: float) -> dict[str, torch.Tensor]:
     """Displacements (T, 7 N, 3) [m] on a ``stencil`` -> smoothness, volume, rigidity.
 
-    F = I + ∂d/∂x by central differences; volume (det F - 1)², rigidity |FᵀF - I|², smoothness second differences/step.
+    Means over the stencils, dimensionless. F = I + ∂d/∂x by central differences. volume: (det F - 1)². rigidity:
+    |FᵀF - I|². smoothness: squared second differences over ``step`` [m].
     """
     d = displacements.reshape(len(displacements), 7, -1, 3)
     middle, ahead, behind = d[:, :1], d[:, 1:4], d[:, 4:7]

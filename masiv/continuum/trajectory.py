@@ -1,7 +1,7 @@
 """Dense motion of the filled continuum (MASIV, section "Continuum Trajectory Estimation").
 
-The particles that fill frame 0 are carried by a copy of the motion network that the pictures trained; the network, not
-the particles, is fine-tuned until they fill every other frame. d(x, 0) = 0 by construction, so frame 0 stays put.
+A copy of the deformation network of ``reconstruct`` moves the particles that fill frame 0. The network, not the
+particles, is fine-tuned until they fill every other frame. d(x, 0) = 0 by construction, so frame 0 does not change.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
@@ -23,21 +23,19 @@ from masiv.files import write_npz
 from masiv.hull.carve import visual_hull
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
-
-if TYPE_CHECKING:
-    from masiv.splat.deformation import DeformationNetwork
-    from masiv.splat.dynamic import DynamicGaussians
+from masiv.splat.deformation import DeformationNetwork
+from masiv.splat.dynamic import DynamicGaussians
 
 _CHUNK = 8
-"""Times evaluated at once: bounds the memory of long queries."""
+"""Times that are evaluated together: limits the memory."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """Motion of the continuum.
 
-    positions (T, Q, 3) float32 [m, world] at times (T,) [s]; positions[0] is the canonical frame. spacing [m]: a
-    particle stands for spacing³; volume = Q spacing³ [m³]; ``network`` knows the motion between the frames.
+    positions (T, Q, 3) float32 [m, world] at times (T,) [s]; positions[0] is the canonical frame. Each particle has
+    the volume spacing³ [m³]; volume = Q spacing³ [m³]. ``network`` gives the motion between the frames.
     """
 
     positions: np.ndarray
@@ -48,10 +46,10 @@ class Trajectory:
 
     def evaluate(self, times: np.ndarray) -> np.ndarray:
         """Positions (K, Q, 3) float32 [m] at any ``times`` (K,) [s] within the observed span."""
-        return carry(self.network, self.positions[0], times)
+        return positions_at(self.network, self.positions[0], times)
 
     def save(self, path: Path) -> None:
-        """Write ``path`` (.npz): positions, times, spacing, volume and the network; complete or not at all."""
+        """Write ``path`` (.npz): positions, times, spacing, volume and the network, completely or not at all."""
         weights = {f"network/{name}": value.detach().numpy() for name, value in self.network.state_dict().items()}
         write_npz(
             path,
@@ -65,11 +63,7 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:
-        """Read what ``save`` wrote. Raises InputError where ``path`` is missing or is something else."""
-        import torch
-
-        from masiv.splat.deformation import DeformationNetwork
-
+        """Read what ``save`` wrote. Raises InputError if ``path`` is missing or another file."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 weights = {
@@ -94,29 +88,29 @@ def estimate_trajectory(
     checkpoint: Checkpoint | None = None,
     progress: Progress = silent,
 ) -> Trajectory:
-    """Fill frame 0 and follow its particles through every frame that ``scene`` may look at.
+    """Fill frame 0 and estimate the motion of its particles over all frames of ``scene``.
 
-    Raises MasivError where a frame leaves nothing to fill or the motion becomes non-finite.
+    Held-out views are not used. Raises MasivError if a frame has no volume to fill or the motion becomes non-finite.
     """
     checkpoint = checkpoint or Checkpoint(None)
-    start = fill_start(scene, dynamic, config)
+    start = fill_first_frame(scene, dynamic, config)
     hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
     volumes = []
     for frame in range(1, scene.frame_count):
         progress("fill", frame, scene.frame_count - 1)
         volumes.append(fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=hull))
     network = fine_tune(scene, dynamic, start, volumes, config, seed=seed, checkpoint=checkpoint, progress=progress)
-    positions = carry(network, start.points, scene.times)
+    positions = positions_at(network, start.points, scene.times)
     if not np.isfinite(positions).all():
         raise MasivError("trajectory: the motion became non-finite; lower trajectory.learning_rate")
     return Trajectory(positions, scene.times, start.spacing, start.volume, network)
 
 
-def fill_start(scene: Scene, dynamic: DynamicGaussians, config: TrajectoryConfig) -> FilledVolume:
-    """The canonical continuum: frame 0 filled, less what its own motion carries out of the masks of later frames.
+def fill_first_frame(scene: Scene, dynamic: DynamicGaussians, config: TrajectoryConfig) -> FilledVolume:
+    """The canonical continuum: frame 0 filled, without the points whose motion leaves the masks of later frames.
 
-    Carving across time gives a static hull as many silhouettes as there are frames: the corners of the hull that no
-    camera sees at frame 0 stick out once the object has turned or touched the ground.
+    Carving over time uses the silhouettes of all frames. Corners of the hull that no camera can exclude at frame 0 are
+    outside of a silhouette as soon as the object has turned or touched the ground.
     """
     field = density_field(scene, dynamic, 0, config)
     solid = np.argwhere(field.density > 0.5)
@@ -124,16 +118,14 @@ def fill_start(scene: Scene, dynamic: DynamicGaussians, config: TrajectoryConfig
     kept = consistent_particles(scene, dynamic.deformation, voxels, config)
     field.density[tuple(solid[~kept].T)] = 0.0
     if not kept.any():
-        raise MasivError("trajectory: the motion carries the object out of its masks; run reconstruct for longer")
+        raise MasivError("trajectory: the motion moves the whole object out of its masks; run reconstruct for longer")
     spacing = (field.volume / config.particle_count) ** (1 / 3)
     points = even_points(field, spacing)
     return FilledVolume(points, spacing, len(points) * spacing**3)
 
 
-def carry(network: DeformationNetwork, start: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Frame-0 points (Q, 3) [m] at ``times`` (K,) [s] -> (K, Q, 3) float32 [m]."""
-    import torch
-
+def positions_at(network: DeformationNetwork, start: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Positions (K, Q, 3) float32 [m] at ``times`` (K,) [s] of the points that are at ``start`` (Q, 3) at frame 0."""
     points = torch.as_tensor(np.asarray(start), dtype=torch.float32)
     times = torch.as_tensor(np.asarray(times), dtype=torch.float32)
     with torch.no_grad():

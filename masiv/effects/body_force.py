@@ -2,17 +2,18 @@
 
 import taichi as ti
 
-from masiv.effects.effect import Effect, EffectParameter
+from masiv.effects.context import EffectParameter
+from masiv.effects.effect import NodalEffect
 
 
 @ti.func
-def _pushed(x, v, held, t, dt, dx, c):
+def _accelerated(x, v, t, dt, dx, c):
     return v + dt * ti.Vector([c[0], c[1], c[2]])
 
 
-class BodyForce(Effect):
-    """dv/dt = a: wind, gravity that is tilted or of another size, a pull from so far that it is the same all along the
-    path; one run cannot tell these apart."""
+class BodyForce(NodalEffect):
+    r"""$\dot v = a$: wind, gravity of another direction or size, the attraction of something far away. One observation
+    does not distinguish these."""
 
     name = "body_force"
     looks_like = (
@@ -21,7 +22,6 @@ class BodyForce(Effect):
     )
     parameters = tuple(EffectParameter(f"acceleration_{axis}", "m/s^2", -20.0, 20.0, 0.05) for axis in "xyz")
     strengths = 3
-    on_grid = "nodes"
 
     def node_velocity(self):
-        return _pushed
+        return _accelerated

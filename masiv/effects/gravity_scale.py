@@ -2,24 +2,25 @@
 
 import taichi as ti
 
-from masiv.effects.effect import Effect, EffectParameter
+from masiv.effects.context import EffectParameter
+from masiv.effects.effect import NodalEffect
 
 
 @ti.func
-def _pulled(x, v, held, t, dt, dx, c):
+def _accelerated(x, v, t, dt, dx, c):
     return v + dt * ti.Vector([c[0], c[1], c[2]])
 
 
-class GravityScale(Effect):
-    """dv/dt = theta g, on top of gravity g: buoyancy (theta < 0), or lengths of the scene that are off by a factor."""
+class GravityScale(NodalEffect):
+    r"""$\dot v = \theta g$ in addition to gravity $g$: buoyancy ($\theta < 0$), or lengths of the scene that
+    are off by a factor."""
 
     name = "gravity_scale"
     looks_like = "everything falls faster or slower than it should, straight down"
     parameters = (EffectParameter("relative_change", "1", -1.0, 3.0, 0.01),)
-    on_grid = "nodes"
 
     def node_velocity(self):
-        return _pulled
+        return _accelerated
 
-    def coefficients(self, theta, setting):
-        return theta * setting.gravity
+    def coefficients(self, theta, context):
+        return theta * context.gravity

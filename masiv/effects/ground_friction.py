@@ -2,11 +2,13 @@
 
 import taichi as ti
 
-from masiv.effects.effect import Effect, EffectParameter
+from masiv.effects.context import EffectParameter
+from masiv.effects.effect import ContactEffect
+from masiv.effects.search_hints import SearchHints
 
 
 @ti.func
-def _slid(x, v, held, t, dt, dx, c):
+def _sliding(x, v, held, t, dt, dx, c):
     out = held
     lost = ti.Vector([v[0] - held[0], 0.0, v[2] - held[2]])
     speed = ti.sqrt(lost.dot(lost) + 1e-20)  # with a derivative at rest
@@ -16,20 +18,22 @@ def _slid(x, v, held, t, dt, dx, c):
     return out
 
 
-class GroundFriction(Effect):
-    """Coulomb friction with the ground. The parameter is the slipperiness 1/mu, which is zero in a model whose ground
-    holds what is pressed to it (sticky, release). Where friction is declared, the smaller coefficient counts.
+class GroundFriction(ContactEffect):
+    r"""Coulomb friction with the ground:
 
-    Of the tangential velocity that the model's contact would take from a node, no more than mu times the normal
-    velocity that it takes is taken (on sticky ground, also where that keeps matter from leaving). Little slips while mu
-    is large, so the response at zero is weak: a score needs a change as large as ``step`` (mu = 2).
+    $$v_i = \hat v_i + \max\!\left(0,\; 1 - \frac{\mu\,|\Delta v_n|}{|\Delta v_t|}\right) \Delta v_t,
+    \qquad \Delta v = v_i - \hat v_i$$
+
+    with normal part n (y) and tangential part t. The parameter is the slipperiness $1/\mu$: zero in a model whose
+    ground holds what is pressed to it (contact sticky, release). If friction is declared too, the smaller coefficient
+    counts. On sticky ground the normal part also counts if it keeps matter from leaving. Little slips if $\mu$ is
+    large, so the response at zero is weak: a score needs a change as large as ``step`` ($\mu$ = 2).
     """
 
     name = "ground_friction"
     looks_like = "after it lands the body slides on, where it should have stuck"
     parameters = (EffectParameter("slipperiness", "1", 0.0, 100.0, 0.5),)
-    on_grid = "ground"
-    nonsmooth = True
+    hints = SearchHints(nonsmooth=True)
 
-    def node_velocity(self):
-        return _slid
+    def contact_velocity(self):
+        return _sliding

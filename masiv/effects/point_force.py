@@ -1,28 +1,30 @@
-"""Something that pulls or pushes at one place."""
+"""A force at one place of the body."""
 
 from __future__ import annotations
 
-from masiv.effects._place import PLACE, as_guesses, faces, shares
-from masiv.effects.effect import Effect, EffectParameter
+from masiv.effects.context import EffectContext, EffectParameter
+from masiv.effects.effect import ForceEffect
+from masiv.effects.places import PLACE, as_guesses, face_centres, weights_around
+from masiv.effects.search_hints import SearchHints
 
 
-class PointForce(Effect):
-    """A force that does not change, on the matter round a place of the body at frame 0 (spread as ``PointMass`` is):
-    it stays with that matter as the body moves. Unlike a mass, it slows nothing.
+def _guesses(context: EffectContext) -> list[tuple[float, ...]]:
+    """Centres of the body's faces."""
+    return as_guesses(face_centres(context.rest))
 
-    A body in flight moves under it as in a wind, and turns, so it is looked for in bodies that are held.
+
+class PointForce(ForceEffect):
+    r"""$f_p = w_p f$ with $\sum_p w_p = 1$: a constant force on the matter around a place of the body at frame 0, with
+    the weights of ``PointMass``. It stays with that matter as the body moves. Unlike a mass, it adds no inertia.
+
+    A body in flight moves under it as in a wind, and turns, so it is looked for in clamped bodies.
     """
 
     name = "point_force"
     looks_like = "a held body rests, or swings about, another place, as fast as it would without"
     parameters = (*(EffectParameter(f"force_{axis}", "N", -1e4, 1e4, 1.0) for axis in "xyz"), *PLACE)
     strengths = 3
-    needs_clamp = True
-    inside = True
+    hints = SearchHints(guesses=_guesses, needs_clamp=True, inside=True)
 
-    def force(self, theta, setting):
-        return shares(setting.rest, theta[3:6], setting.size / 8)[:, None] * theta[:3]
-
-    def guesses(self, setting):
-        """Middles of the body's faces."""
-        return as_guesses(faces(setting.rest))
+    def force(self, theta, context):
+        return weights_around(context.rest, theta[3:6], context.size / 8)[:, None] * theta[:3]

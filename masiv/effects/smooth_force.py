@@ -1,14 +1,16 @@
-"""What is left when no cause is known: a force that changes slowly in time and space."""
+"""A discrepancy force for motion that no effect of the library explains."""
 
 import taichi as ti
 
-from masiv.effects.effect import Effect, EffectParameter
+from masiv.effects.context import EffectContext, EffectParameter
+from masiv.effects.effect import NodalEffect
+from masiv.effects.search_hints import SearchHints
 
 KNOTS = 4
 
 
 @ti.func
-def _pushed(x, v, held, t, dt, dx, c):
+def _accelerated(x, v, t, dt, dx, c):
     span = c[3 * KNOTS + 9]
     at = ti.min(ti.max(t / span, 0.0), 1.0) * (KNOTS - 1)
     a = ti.Vector([c[3 * KNOTS], c[3 * KNOTS + 1], c[3 * KNOTS + 2]]) * x[0]
@@ -19,15 +21,19 @@ def _pushed(x, v, held, t, dt, dx, c):
     return v + dt * a
 
 
-class SmoothForce(Effect):
-    """dv/dt = a(t) + G x: a is linear between four instants of [0, span] and stays as it is after, x is the place.
+def _guesses(context: EffectContext) -> list[tuple[float, ...]]:
+    return [(context.duration,)]
 
-    No cause, but a stop-gap: it stands in for one that the library lacks.
+
+class SmoothForce(NodalEffect):
+    r"""$\dot v = a(t) + G x$: $a$ is linear between four instants of [0, span] and constant after it, $x$ is the place.
+
+    It is not a cause: it represents one that the library lacks.
     """
 
     name = "smooth_force"
     looks_like = "not a cause: a smooth force that stands in for one that is not known"
-    cause = False
+    hints = SearchHints(guesses=_guesses, cause=False)
     parameters = (
         *(
             EffectParameter(f"acceleration_{k}_{axis}", "m/s^2", -50.0, 50.0, 0.1)
@@ -42,10 +48,6 @@ class SmoothForce(Effect):
         EffectParameter("span", "s", 1e-3, 1e3, 0.05, start=1.0),
     )
     strengths = 3 * KNOTS + 9
-    on_grid = "nodes"
 
     def node_velocity(self):
-        return _pushed
-
-    def guesses(self, setting):
-        return [(setting.duration,)]
+        return _accelerated

@@ -3,8 +3,10 @@
 import taichi as ti
 import torch
 
-from masiv.effects._place import PLACE, as_guesses, cover, square_distance
-from masiv.effects.effect import Effect, EffectParameter
+from masiv.effects.context import EffectContext, EffectParameter
+from masiv.effects.effect import StressEffect
+from masiv.effects.places import PLACE, as_guesses, cluster_centres, square_distance
+from masiv.effects.search_hints import SearchHints
 
 
 @ti.func
@@ -12,8 +14,16 @@ def _scaled(tau, f, c_affine, c):
     return ti.exp(c[0]) * tau
 
 
-class StiffnessContrast(Effect):
-    """tau *= exp(theta b), b = exp(-|X - place|^2 / (2 radius^2)) at the particle's position X at frame 0."""
+def _guesses(context: EffectContext) -> list[tuple[float, ...]]:
+    """Eight parts of the body, each with the radius of such a part."""
+    return as_guesses(cluster_centres(context.rest, 8), 0.25 * context.size)
+
+
+class StiffnessContrast(StressEffect):
+    r"""$\tau_p \leftarrow e^{\theta b_p} \tau_p$ with $b_p = e^{-|X_p - X_0|^2 / (2 r^2)}$.
+
+    $X_p$ is the position of the particle at frame 0, $X_0$ the place and $r$ the radius.
+    """
 
     name = "stiffness_contrast"
     looks_like = "one part gives way less, or more, than the rest when the body hits something"
@@ -22,15 +32,11 @@ class StiffnessContrast(Effect):
         *PLACE,
         EffectParameter("radius", "m", 0.01, 10.0, 0.02, start=0.15),
     )
-    on_stress = True
+    hints = SearchHints(guesses=_guesses)
 
     def particle_stress(self):
         return _scaled
 
-    def coefficients(self, theta, setting):
-        bump = torch.exp(-0.5 * square_distance(setting.rest, theta[1:4]) / theta[4] ** 2)
+    def coefficients(self, theta, context):
+        bump = torch.exp(-0.5 * square_distance(context.rest, theta[1:4]) / theta[4] ** 2)
         return (theta[0] * bump)[:, None]
-
-    def guesses(self, setting):
-        """Eight parts of the body, each with the radius of such a part."""
-        return as_guesses(cover(setting.rest, 8), 0.25 * setting.size)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from masiv.effects.effect import Effect, EffectParameter
+from masiv.effects.context import EffectParameter
+from masiv.effects.effect import ClockEffect
 
 
-class TimeOffset(Effect):
-    """The frame stamped t was taken at t + theta, counted from the instant at which the body starts."""
+class TimeOffset(ClockEffect):
+    r"""The frame with time stamp $t$ was taken at $t + \theta$; $t = 0$ is the instant at which the body starts."""
 
     name = "time_offset"
     looks_like = "the motion is right but early or late by the same time throughout, most visible where it is fast"

@@ -33,35 +33,36 @@ class VisualHull:
 
 
 def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull:
-    """Carve the object of ``frame`` from the masks that ``scene`` may look at.
+    """Carve the hull of the object at ``frame`` from the masks of all views that are not held out.
 
-    The box is found from the masks alone; its longest side gets ``resolution`` voxels. A voxel is kept where no view
-    whose image shows it says that it is outside of the mask (by more than a quarter voxel, so that thin parts survive),
-    and where at least half of the views, two or more, have it in their image. Raises MasivError when nothing is left.
+    The bounding box follows from the masks; its longest side gets ``resolution`` voxels. A voxel is kept if its centre
+    is at most a quarter voxel outside of every mask that shows it (so that thin parts survive) and if it is inside the
+    image of at least two views and of half of them. Raises MasivError if fewer than two masks show the object or no
+    voxel is left.
     """
     views = silhouettes(scene, frame)
-    seen = [v for v in views if (v.distance < 0).any()]
-    if len(seen) < 2:
+    occupied_views = [v for v in views if (v.distance < 0).any()]
+    if len(occupied_views) < 2:
         raise MasivError(
-            f"frame {frame} of {scene.path}: the object is in the mask of {len(seen)} of {len(views)} views, a visual "
-            "hull needs 2; check the masks of that frame"
+            f"frame {frame} of {scene.path}: the object is in the mask of {len(occupied_views)} of {len(views)} views, "
+            "a visual hull needs 2; check the masks of that frame"
         )
-    lower, upper = _object_box(views, seen, scene.ground, frame, scene)
+    lower, upper = _object_box(views, occupied_views, scene.ground, frame, scene)
     spacing = float((upper - lower).max()) / resolution
     counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
     grid = _cell_centres(lower, spacing, counts)
     occupied = occupancy(views, grid, 0.25 * spacing, scene.ground).reshape(counts)
     if not occupied.any():
-        raise MasivError(_nothing_left(views, seen, scene, frame))
+        raise MasivError(_no_volume(views, occupied_views, scene, frame))
     return VisualHull(grid[occupied.ravel()], spacing, surface_of(occupied)[occupied])
 
 
 def occupancy(
     views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float, ground: Ground | None = None
 ) -> np.ndarray:
-    """Which world points (N, 3) [m] no view rules out: within ``tolerance`` [m] of every silhouette, above the ground.
+    """Which world points (N, 3) [m] are within ``tolerance`` [m] of every silhouette and above the ground, (N,) bool.
 
-    A point must be in the image of at least two views and of half of them. Returns (N,) bool.
+    A point must be inside the image of at least two views and of half of them.
     """
     kept = np.ones(len(points), bool)
     if ground is not None:
@@ -69,19 +70,19 @@ def occupancy(
     shown = np.zeros(len(points), np.int32)
     for view in views:
         alive = np.flatnonzero(kept)
-        distance, inside_image, _ = view.outside(points[alive])
+        distance, inside_image, _ = view.distances(points[alive])
         shown[alive] += inside_image
         kept[alive] = distance <= tolerance
     return kept & (shown >= max(2, len(views) // 2))
 
 
 def surface_of(occupied: np.ndarray) -> np.ndarray:
-    """Cells (I, J, K) bool that are occupied and have an empty neighbour among six (the box's outside is empty)."""
+    """Which cells (I, J, K) of ``occupied`` have an empty one among their six neighbours; outside the box is empty."""
     return occupied & ~ndimage.binary_erosion(occupied)
 
 
 def _object_box(views, seen, ground, frame: int, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest box of the hull, by carving coarse grids that shrink. Returns its corners (3,), (3,) [m]."""
+    """Corners (3,), (3,) [m] of the hull's bounding box, from coarse grids that shrink."""
     centre = _nearest_to_rays(seen)
     radius = max(_radius_around(view, centre) for view in seen)
     lower, upper = centre - radius, centre + radius
@@ -89,10 +90,10 @@ def _object_box(views, seen, ground, frame: int, scene: Scene) -> tuple[np.ndarr
         spacing = float((upper - lower).max()) / _COARSE
         counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
         grid = _cell_centres(lower, spacing, counts)
-        # Half of a cell's diagonal: no cell that holds a piece of the object is lost.
+        # Half of a cell's diagonal: no cell that contains a part of the object is removed.
         kept = grid[occupancy(views, grid, 0.87 * spacing, ground)]
         if len(kept) == 0:
-            raise MasivError(_nothing_left(views, seen, scene, frame))
+            raise MasivError(_no_volume(views, seen, scene, frame))
         lower, upper = (
             np.maximum(lower, kept.min(axis=0) - 0.5 * spacing),
             np.minimum(upper, kept.max(axis=0) + 0.5 * spacing),
@@ -106,7 +107,7 @@ def _cell_centres(lower: np.ndarray, spacing: float, counts: np.ndarray) -> np.n
 
 
 def _nearest_to_rays(seen: list[Silhouette]) -> np.ndarray:
-    """The point (3,) [m] nearest, in least squares, to the rays through the centroids of the masks."""
+    """The point (3,) [m] with the least sum of squared distances to the rays through the centroids of the masks."""
     normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
     for view in seen:
         rows, columns = np.nonzero(view.distance < 0)
@@ -127,8 +128,8 @@ def _radius_around(view: Silhouette, centre: np.ndarray) -> float:
     return float((reach + 1.0) * abs(depth[0]) / min(view.camera.intrinsics[0, 0], view.camera.intrinsics[1, 1]))
 
 
-def _nothing_left(views, seen: list[Silhouette], scene: Scene, frame: int) -> str:
-    """Say which view contradicts the others most: the one whose absence leaves the largest volume."""
+def _no_volume(views, seen: list[Silhouette], scene: Scene, frame: int) -> str:
+    """The error message. It names the view that contradicts the others most: without it the volume is largest."""
     centre = _nearest_to_rays(seen)
     radius = max(_radius_around(view, centre) for view in seen)
     spacing = 2 * radius / _COARSE

@@ -1,4 +1,4 @@
-"""Masks as signed distance fields: how far a world point is outside of the silhouettes of one frame."""
+"""Masks as signed distance fields: the distance of a world point to the silhouettes of one frame."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Silhouette:
     distance: np.ndarray
     valid: np.ndarray
 
-    def outside(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Judge world points (N, 3) [m] by this view.
+    def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Signed distances of world points (N, 3) [m] to this silhouette, (N,) [m], measured at each point's depth.
 
-        Returns the signed distance to the silhouette (N,) [m at the point's depth, negative on the object, 0 where the
-        view cannot tell], ``inside_image`` (N,) bool, and ``judged`` (N,) bool: in the image, not behind an occluder.
+        Negative on the object, 0 for a point that is not visible. Also returns ``inside_image`` (N,) bool and
+        ``visible`` (N,) bool: inside the image and not behind an occluder.
         """
         pixels, depth = self.camera.project(points)
         height, width = self.distance.shape
@@ -33,32 +33,29 @@ class Silhouette:
         inside_image = in_front & (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
         column = np.clip(pixels[:, 0], 0, width - 1).astype(np.int32)
         row = np.clip(pixels[:, 1], 0, height - 1).astype(np.int32)
-        judged = inside_image & self.valid[row, column]
+        visible = inside_image & self.valid[row, column]
         pixel_distance = sample_bilinear(self.distance, pixels)
         metres_per_pixel = np.where(in_front, depth, 0.0) / self.camera.intrinsics[0, 0]
-        return np.where(judged, pixel_distance * metres_per_pixel, 0.0), inside_image, judged
+        return np.where(visible, pixel_distance * metres_per_pixel, 0.0), inside_image, visible
 
 
 def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
-    """The silhouettes of ``frame`` in every view that the scene may look at."""
-    found = []
-    for view in scene.views:
-        picture = scene.frame(view, frame)
-        found.append(Silhouette(view, scene.cameras[view], signed_distance(picture.mask), picture.valid))
-    return tuple(found)
+    """The silhouettes of ``frame`` in every view that is not held out."""
+    pictures = ((view, scene.frame(view, frame)) for view in scene.views)
+    return tuple(Silhouette(view, scene.cameras[view], signed_distance(p.mask), p.valid) for view, p in pictures)
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:
     """mask (H, W) -> (H, W) float32 [pixels]: from pixel centres to the edge of {mask > 0.5}, negative on it.
 
-    An empty mask is infinitely far away: the image's diagonal everywhere.
+    For an empty mask the distance is the diagonal of the image everywhere.
     """
     on = (mask > 0.5).astype(np.uint8)
     diagonal = float(np.hypot(*mask.shape))
     if not on.any():
         return np.full(mask.shape, diagonal, np.float32)
     outwards = cv2.distanceTransform(1 - on, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    # Beyond the border the object may go on, so the border is no edge.
+    # The object may continue beyond the border, so the border is not an edge of the mask.
     padded = cv2.copyMakeBorder(on, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
     inwards = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     return np.where(on > 0, 0.5 - np.minimum(inwards, diagonal), outwards - 0.5).astype(np.float32)

@@ -69,7 +69,7 @@ def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:
     """Poisson's ratio, where the scene declares it: no more than what is affordable."""
     if body.poissons_ratio is None:
         return {}
-    return {"poissons_ratio": min(body.poissons_ratio, config.highest_poissons_ratio)}
+    return {"poissons_ratio": min(body.poissons_ratio, config.max_poissons_ratio)}
 
 
 def fit_law(simulation: ClampedBodyModel, family: Family, config: TracksConfig, progress: Progress) -> ModelFit:

@@ -68,12 +68,8 @@ class OpenGrid:
 
 @ti.data_oriented
 class NodeKernels:
-    """``function(x, v, held, t, dt, dx, c) -> v`` on the nodes of the grid: position [m], velocity [m/s] after gravity
-    and earlier effects, the velocity that the ground's contact would give, time [s], substep [s], cell [m], and the
-    coefficients.
-
-    grounded: the function is the ground's contact and is applied to nodes on or below it alone; otherwise held is v.
-    """
+    """Function of ``NodalEffect.node_velocity`` or, if ``grounded``, ``ContactEffect.contact_velocity`` on the nodes of
+    the grid. A grounded one is applied to nodes on or below the ground alone."""
 
     def __init__(self, mpm, function, coefficients: int, grounded: bool):
         self.mpm = mpm
@@ -116,13 +112,12 @@ class NodeKernels:
     @ti.func
     def result(self, n: ti.i32, t: ti.f64):
         """The function at node n, of ``before``, ``held`` and ``coefficients``."""
-        v = self.before[n]
-        held = v
+        dt, dx, now = self.mpm.constants[DT], self.mpm.constants[DX], ti.cast(t, self.mpm.real)
+        x, v = self.mpm.node_position(n), self.before[n]
         if ti.static(self.grounded):
-            held = self.held[n]
-        dt, dx = self.mpm.constants[DT], self.mpm.constants[DX]
-        x = self.mpm.node_position(n)
-        return self.function(x, v, held, ti.cast(t, self.mpm.real), dt, dx, self.coefficients[n])
+            return self.function(x, v, self.held[n], now, dt, dx, self.coefficients[n])
+        else:
+            return self.function(x, v, now, dt, dx, self.coefficients[n])
 
     @ti.kernel
     def apply(self, nodes: ti.i32, t: ti.f64):
@@ -192,7 +187,7 @@ class GridWithEffects:
                 v = momentum_of(value) / value[3] + dt * self.mpm.gravity()
                 x = self.mpm.node_position(n)
                 for e in ti.static(range(self.on_nodes)):
-                    v = self.functions[e](x, v, v, now, dt, dx, self.coefficients[e][0])
+                    v = self.functions[e](x, v, now, dt, dx, self.coefficients[e][0])
                 if grounded:
                     held = self.mpm.contact_velocity(v)
                     if ti.static(self.on_ground):
@@ -215,7 +210,7 @@ class GridWithEffects:
 
 @ti.data_oriented
 class ForceKernels:
-    """A force (N, 3) [N] on the particles that does not change: v += dt f / m at the end of each substep."""
+    """A constant force (N, 3) [N] on the particles: v += dt f / m at the end of each substep."""
 
     def __init__(self, mpm):
         self.mpm = mpm

@@ -32,7 +32,7 @@ class GridKernels:
         self.capacity_log = capacity_log
         self.gpu = gpu
         self.chunks = 1 if gpu else chunks
-        self.private = ti.Vector.field(4, real, shape=(self.chunks, capacity_nodes))
+        self.partial_grids = ti.Vector.field(4, real, shape=(self.chunks, capacity_nodes))
         # (momentum, mass) of the nodes: scratch, then a log from which the adjoint takes the grids of past substeps.
         self.grid_momentum = ti.Vector.field(4, real, shape=capacity_log)
         self.grid_velocity = ti.Vector.field(4, real, shape=capacity_nodes)  # the fourth pads: one aligned load
@@ -54,7 +54,7 @@ class GridKernels:
         return w
 
     @ti.func
-    def weight_slopes(self, fx):
+    def weight_gradients(self, fx):
         """Derivative of ``weights`` with respect to fx."""
         g = ti.Matrix.zero(self.real, 3, 3)
         for a in ti.static(range(3)):
@@ -79,9 +79,9 @@ class GridKernels:
     @ti.func
     def add(self, t: ti.i32, node: ti.i32, value):
         if ti.static(self.gpu):
-            self.private[t, node] += value
+            self.partial_grids[t, node] += value
         else:
-            self.private[t, node] = self.private[t, node] + value
+            self.partial_grids[t, node] = self.partial_grids[t, node] + value
 
     @ti.func
     def node_height(self, row: ti.i32):
@@ -107,9 +107,9 @@ class GridKernels:
 
     @ti.func
     def sum_of_chunks(self, n: ti.i32):
-        value = self.private[0, n]
+        value = self.partial_grids[0, n]
         for t in ti.static(range(1, self.chunks)):
-            value += self.private[t, n]
+            value += self.partial_grids[t, n]
         return value
 
     @ti.func

@@ -2,7 +2,7 @@
 
 Forward (Hu et al. 2018, "A moving least squares material point method"):
 
-    p2g   private[t, i] += w_ip (m v_p + A_p d_ip, m),  A_p = m C_p - dt V 4/dx^2 tau_p,  d_ip = x_i - x_p
+    p2g   partial_grids[t, i] += w_ip (m v_p + A_p d_ip, m),  A_p = m C_p - dt V 4/dx^2 tau_p,  d_ip = x_i - x_p
     grid  v_i = momentum_i / m_i + dt g, then contact with the ground plane y = 0
     g2p   v_p = sum w v_i,  C_p = 4/dx^2 sum w v_i d^T,  x_p += dt v_p,  F_trial = (I + dt C_p) F
 
@@ -11,11 +11,20 @@ in ``masiv.kernels.grid``. State fields are allocated by capacity, and live coun
 is part of a compiled kernel.
 """
 
+from collections.abc import Callable, Hashable
+from typing import Any
+
 import taichi as ti
+import torch
 
 from masiv.kernels.grid import DT, DX, VOLUME, GridKernels, momentum_of
 
-NO_FAULT = (1 << 62) - 1
+NO_ERROR = (1 << 62) - 1
+
+
+def log_entries_a_substep(particles: int) -> int:
+    """Nodes of the log that are reserved for the grid of one substep; larger windows fill it with fewer substeps."""
+    return max(4096, particles)
 
 
 @ti.func
@@ -37,11 +46,13 @@ class MpmKernels(GridKernels):
     """
 
     def __init__(self, real, capacity_steps: int, capacity_particles: int, capacity_nodes: int, chunks: int, gpu: bool):
-        capacity_log = capacity_nodes + capacity_steps * max(4096, capacity_particles)
+        capacity_log = capacity_nodes + capacity_steps * log_entries_a_substep(capacity_particles)
         super().__init__(real, capacity_nodes, capacity_log, chunks, gpu)
         self.capacity_steps = capacity_steps
         self.capacity_particles = capacity_particles
-        self.owner = None  # whose states the fields hold
+        self.torch_dtype = torch.float64 if real == ti.f64 else torch.float32
+        self.owner: object = None  # the rollout whose states the fields hold
+        self._attached: dict[Hashable, Any] = {}
         stored = (capacity_steps + 1, capacity_particles)
         self.position = ti.Vector.field(3, real, shape=stored)
         self.velocity = ti.Vector.field(3, real, shape=stored)
@@ -57,7 +68,18 @@ class MpmKernels(GridKernels):
         self.stress_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
         self.particle_mass = ti.field(real, shape=capacity_particles)
         self.mass_bar = ti.field(real, shape=capacity_particles)
-        self.fault = ti.field(ti.i64, shape=2)  # first (substep << 32 | particle) that broke CFL; that left the window
+        self.error_flag = ti.field(
+            ti.i64, shape=2
+        )  # first (substep << 32 | particle) that broke CFL; that left the window
+
+    def attached(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """Kernels with fields of their own for these fields, made once for each ``key``.
+
+        They live as long as these: Taichi frees no field before the process ends.
+        """
+        if key not in self._attached:
+            self._attached[key] = make()
+        return self._attached[key]
 
     # ---- forward -----------------------------------------------------------------------------------------------------
 
@@ -84,20 +106,20 @@ class MpmKernels(GridKernels):
                         value = ti.Vector([m[0], m[1], m[2], weight * w[k, 2] * mass])
                         self.add(t, row + j * nz + k, value)
         else:
-            ti.atomic_min(self.fault[1], (ti.cast(s, ti.i64) << 32) | p)
+            ti.atomic_min(self.error_flag[1], (ti.cast(s, ti.i64) << 32) | p)
 
     @ti.kernel
     def p2g(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
         if ti.static(self.gpu):
             for n in range(nodes):
-                self.private[0, n] = ti.Vector.zero(self.real, 4)
+                self.partial_grids[0, n] = ti.Vector.zero(self.real, 4)
             for p in range(count):
                 self.p2g_particle(0, s, p)
         else:
             ti.loop_config(block_dim=1)
             for t in range(self.chunks):
                 for n in range(nodes):
-                    self.private[t, n] = ti.Vector.zero(self.real, 4)
+                    self.partial_grids[t, n] = ti.Vector.zero(self.real, 4)
                 for p in range(t * count // self.chunks, (t + 1) * count // self.chunks):
                     self.p2g_particle(t, s, p)
 
@@ -129,7 +151,7 @@ class MpmKernels(GridKernels):
             v = momentum_of(v4)
             affine = (4.0 / dx) * (b - v.outer_product(fx))
             if not v.norm() * dt < dx:  # also true for NaN
-                ti.atomic_min(self.fault[0], (ti.cast(s, ti.i64) << 32) | p)
+                ti.atomic_min(self.error_flag[0], (ti.cast(s, ti.i64) << 32) | p)
             self.velocity[s + 1, p] = v
             self.affine_velocity[s + 1, p] = affine
             self.position[s + 1, p] = x + dt * v
@@ -162,19 +184,19 @@ class MpmKernels(GridKernels):
 
     @ti.kernel
     def set_window(self, ox: ti.i32, oy: ti.i32, oz: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
-        """Make this the window; no fault is known in it yet."""
+        """Make this the window; the error flags are cleared."""
         self.window_origin[None] = ti.Vector([ox, oy, oz])
         self.window_shape[None] = ti.Vector([nx, ny, nz])
         for i in ti.static(range(2)):
-            self.fault[i] = ti.i64(NO_FAULT)
+            self.error_flag[i] = ti.i64(NO_ERROR)
 
     @ti.kernel
-    def faults(self) -> ti.types.vector(2, ti.i64):
-        return ti.Vector([self.fault[0], self.fault[1]])
+    def errors(self) -> ti.types.vector(2, ti.i64):
+        return ti.Vector([self.error_flag[0], self.error_flag[1]])
 
-    def read_fault(self):
+    def read_errors(self):
         """(too fast, outside of the window): each substep << 32 | particle, or -1."""
-        return tuple(-1 if fault == NO_FAULT else int(fault) for fault in self.faults())
+        return tuple(-1 if flag == NO_ERROR else int(flag) for flag in self.errors())
 
     # ---- adjoint -------------------------------------------------------------------------------------------------
     # ``*_bar`` hold the adjoint of the state after substep s; each kernel replaces them by that before it.
@@ -184,7 +206,7 @@ class MpmKernels(GridKernels):
         dx, dt = self.constants[DX], self.constants[DT]
         local, fx, _ = self.stencil(self.position[s, p], dx)
         ny, nz = self.window_shape[None][1], self.window_shape[None][2]
-        w, g = self.weights(fx), self.weight_slopes(fx)
+        w, g = self.weights(fx), self.weight_gradients(fx)
         trial_bar = self.trial_bar[p]
         affine = self.affine_velocity[s + 1, p]
         v_bar = self.velocity_bar[p] + dt * self.position_bar[p]
@@ -199,7 +221,7 @@ class MpmKernels(GridKernels):
             for j in ti.static(range(3)):
                 weight = w[i, 0] * w[j, 1]
                 push_j = corner + i * column(slope, 0) + j * column(slope, 1)
-                along, along_slope = ti.cast(0.0, self.real), ti.cast(0.0, self.real)
+                along, along_gradient = ti.cast(0.0, self.real), ti.cast(0.0, self.real)
                 for k in ti.static(range(3)):
                     node = row + j * nz + k
                     push = push_j + k * column(slope, 2)
@@ -207,22 +229,22 @@ class MpmKernels(GridKernels):
                     self.add(t, node, ti.Vector([value[0], value[1], value[2], 0.0]))
                     dot = momentum_of(self.grid_velocity[node]).dot(push)
                     along += w[k, 2] * dot
-                    along_slope += g[k, 2] * dot
-                x_bar += ti.Vector([g[i, 0] * w[j, 1] * along, w[i, 0] * g[j, 1] * along, weight * along_slope])
+                    along_gradient += g[k, 2] * dot
+                x_bar += ti.Vector([g[i, 0] * w[j, 1] * along, w[i, 0] * g[j, 1] * along, weight * along_gradient])
         self.position_bar[p] += (x_bar - slope.transpose() @ self.velocity[s + 1, p]) / dx
 
     @ti.kernel
     def g2p_adjoint(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
         if ti.static(self.gpu):
             for n in range(nodes):
-                self.private[0, n] = ti.Vector.zero(self.real, 4)
+                self.partial_grids[0, n] = ti.Vector.zero(self.real, 4)
             for p in range(count):
                 self.g2p_adjoint_particle(0, s, p)
         else:
             ti.loop_config(block_dim=1)
             for t in range(self.chunks):
                 for n in range(nodes):
-                    self.private[t, n] = ti.Vector.zero(self.real, 4)
+                    self.partial_grids[t, n] = ti.Vector.zero(self.real, 4)
                 for p in range(t * count // self.chunks, (t + 1) * count // self.chunks):
                     self.g2p_adjoint_particle(t, s, p)
 
@@ -231,7 +253,7 @@ class MpmKernels(GridKernels):
         dx, dt, mass = self.constants[DX], self.constants[DT], self.particle_mass[p]
         local, fx, _ = self.stencil(self.position[s, p], dx)
         ny, nz = self.window_shape[None][1], self.window_shape[None][2]
-        w, g = self.weights(fx), self.weight_slopes(fx)
+        w, g = self.weights(fx), self.weight_gradients(fx)
         stress_factor = dt * self.constants[VOLUME] * 4.0 / (dx * dx)
         affine = mass * self.affine_velocity[s, p] - stress_factor * self.kirchhoff_stress[s, p]
         corner = mass * self.velocity[s, p] - affine @ (fx * dx)
@@ -245,17 +267,17 @@ class MpmKernels(GridKernels):
             for j in ti.static(range(3)):
                 weight = w[i, 0] * w[j, 1]
                 momentum_j = corner + i * column(step, 0) + j * column(step, 1)
-                along, along_slope = ti.cast(0.0, self.real), ti.cast(0.0, self.real)
+                along, along_gradient = ti.cast(0.0, self.real), ti.cast(0.0, self.real)
                 line, tilt = ti.Vector.zero(self.real, 4), ti.Vector.zero(self.real, 4)
                 for k in ti.static(range(3)):
                     bar = self.grid_momentum_bar[row + j * nz + k]
                     momentum = momentum_j + k * column(step, 2)
                     dot = momentum.dot(momentum_of(bar)) + mass * bar[3]
                     along += w[k, 2] * dot
-                    along_slope += g[k, 2] * dot
+                    along_gradient += g[k, 2] * dot
                     line += w[k, 2] * bar
                     tilt += (k * w[k, 2]) * bar
-                x_bar += ti.Vector([g[i, 0] * w[j, 1] * along, w[i, 0] * g[j, 1] * along, weight * along_slope])
+                x_bar += ti.Vector([g[i, 0] * w[j, 1] * along, w[i, 0] * g[j, 1] * along, weight * along_gradient])
                 plane += w[j, 1] * line
                 b1 += (weight * j) * line
                 b2 += weight * tilt

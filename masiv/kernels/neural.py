@@ -6,19 +6,20 @@ particle interpolates the lattice, the adjoint scatters to it, and the networks 
 
 import taichi as ti
 
-from masiv.kernels import tensor
-from masiv.materials.table import COUNTS, LOWER, STEP
+from masiv.kernels import isotropic
+from masiv.kernels.lattice import LATTICE_COUNTS, LATTICE_LOWER, LATTICE_STEP
+from masiv.kernels.tensor import identity3
 
 
 @ti.data_oriented
 class NeuralKernels:
-    """``moduli`` (nodes, 4): ln g1, ln g2, ln kappa, coupling of ``tensor.neural_stress`` [Pa]; ``flows`` (nodes, 2):
-    -ln of the shares of strain that ``tensor.neural_flow`` keeps. ``*_bar`` are their adjoints by chunk."""
+    """``moduli`` (nodes, 4): ln g1, ln g2, ln kappa, coupling of ``isotropic.stress`` [Pa]; ``flows`` (nodes, 2):
+    -ln of the shares of strain that ``isotropic.flow`` keeps. ``*_bar`` are their adjoints by chunk."""
 
     def __init__(self, mpm):
         self.mpm = mpm
         self.owner = None  # the rollout whose tables the fields hold
-        nodes = COUNTS[0] * COUNTS[1] * COUNTS[2]
+        nodes = LATTICE_COUNTS[0] * LATTICE_COUNTS[1] * LATTICE_COUNTS[2]
         self.moduli = ti.Vector.field(4, mpm.real, shape=nodes)
         self.flows = ti.Vector.field(2, mpm.real, shape=nodes)
         self.strains = ti.field(mpm.real, shape=2)  # strain scale of the elastic and of the plastic features
@@ -108,11 +109,11 @@ class NeuralKernels:
         inside = ti.Vector.zero(self.mpm.real, 3)
         slope = ti.Vector.zero(self.mpm.real, 3)
         for a in ti.static(range(3)):
-            u = (feature[a] - LOWER[a]) / STEP
-            if u > 0.0 and u < COUNTS[a] - 1.0:
-                slope[a] = 1.0 / STEP
-            u = ti.min(ti.max(u, 0.0), COUNTS[a] - 1.0)
-            cell[a] = ti.min(ti.cast(u, ti.i32), COUNTS[a] - 2)
+            u = (feature[a] - LATTICE_LOWER[a]) / LATTICE_STEP
+            if u > 0.0 and u < LATTICE_COUNTS[a] - 1.0:
+                slope[a] = 1.0 / LATTICE_STEP
+            u = ti.min(ti.max(u, 0.0), LATTICE_COUNTS[a] - 1.0)
+            cell[a] = ti.min(ti.cast(u, ti.i32), LATTICE_COUNTS[a] - 2)
             inside[a] = u - cell[a]
         return cell, inside, slope
 
@@ -125,7 +126,7 @@ class NeuralKernels:
                 * (inside[1] if j else 1.0 - inside[1])
                 * (inside[2] if k else 1.0 - inside[2])
             )
-            out += weight * table[((cell[0] + i) * COUNTS[1] + cell[1] + j) * COUNTS[2] + cell[2] + k]
+            out += weight * table[((cell[0] + i) * LATTICE_COUNTS[1] + cell[1] + j) * LATTICE_COUNTS[2] + cell[2] + k]
         return out
 
     @ti.func
@@ -133,7 +134,7 @@ class NeuralKernels:
         """Scatters to ``table_bar``; returns the adjoint of the features."""
         out = ti.Vector.zero(self.mpm.real, 3)
         for i, j, k in ti.static(ti.ndrange(2, 2, 2)):
-            node = ((cell[0] + i) * COUNTS[1] + cell[1] + j) * COUNTS[2] + cell[2] + k
+            node = ((cell[0] + i) * LATTICE_COUNTS[1] + cell[1] + j) * LATTICE_COUNTS[2] + cell[2] + k
             x = inside[0] if i else 1.0 - inside[0]
             y = inside[1] if j else 1.0 - inside[1]
             z = inside[2] if k else 1.0 - inside[2]
@@ -148,7 +149,7 @@ class NeuralKernels:
 
     @ti.func
     def coefficients(self, table_value):
-        """Interpolated moduli -> c of ``tensor.neural_stress``."""
+        """Interpolated moduli -> c of ``isotropic.stress``."""
         return ti.Vector([ti.exp(table_value[0]), ti.exp(table_value[1]), ti.exp(table_value[2]), table_value[3]])
 
     @ti.func
@@ -166,18 +167,18 @@ class NeuralKernels:
     def flow_particle(self, s: ti.i32, p: ti.i32):
         """Trial gradient -> elastic gradient."""
         trial = self.mpm.trial_gradient[s, p]
-        strain = tensor.isochoric_strain(trial)
-        cell, inside, _ = self.locate(self.features(tensor.invariants(strain), self.strains[1]))
+        strain = isotropic.isochoric_strain(trial)
+        cell, inside, _ = self.locate(self.features(isotropic.invariants(strain), self.strains[1]))
         flow = self.sample(self.flows, ti.Vector.zero(self.mpm.real, 2), cell, inside)
-        self.mpm.deformation_gradient[s, p] = tensor.neural_flow(trial, strain, self.share(flow))
+        self.mpm.deformation_gradient[s, p] = isotropic.flow(trial, strain, self.share(flow))
 
     @ti.func
     def stress_particle(self, s: ti.i32, p: ti.i32):
         """Elastic gradient -> stress."""
-        strain = tensor.isochoric_strain(self.mpm.deformation_gradient[s, p])
-        cell, inside, _ = self.locate(self.features(tensor.invariants(strain), self.strains[0]))
+        strain = isotropic.isochoric_strain(self.mpm.deformation_gradient[s, p])
+        cell, inside, _ = self.locate(self.features(isotropic.invariants(strain), self.strains[0]))
         c = self.coefficients(self.sample(self.moduli, ti.Vector.zero(self.mpm.real, 4), cell, inside))
-        self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(strain, c)
+        self.mpm.kirchhoff_stress[s, p] = isotropic.stress(strain, c)
 
     @ti.kernel
     def forward(self, s: ti.i32, count: ti.i32):
@@ -189,37 +190,37 @@ class NeuralKernels:
     def stress_particle_adjoint(self, t: ti.i32, s: ti.i32, p: ti.i32):
         """Adds the stress's part to ``gradient_bar``."""
         f = self.mpm.deformation_gradient[s, p]
-        strain = tensor.isochoric_strain(f)
-        final = tensor.invariants(strain)
+        strain = isotropic.isochoric_strain(f)
+        final = isotropic.invariants(strain)
         cell, inside, slope = self.locate(self.features(final, self.strains[0]))
         c = self.coefficients(self.sample(self.moduli, ti.Vector.zero(self.mpm.real, 4), cell, inside))
-        c_bar, log_j_bar, b_bar, b_inverse_bar = tensor.neural_stress_adjoint(strain, c, self.mpm.stress_bar[p])
+        c_bar, log_j_bar, b_bar, b_inverse_bar = isotropic.stress_adjoint(strain, c, self.mpm.stress_bar[p])
         moduli_bar = ti.Vector([c_bar[0] * c[0], c_bar[1] * c[1], c_bar[2] * c[2], c_bar[3]])
         feature_bar = self.sample_adjoint(self.moduli, self.moduli_bar, t, cell, inside, slope, moduli_bar)
         bar, _ = self.features_adjoint(final, self.strains[0], feature_bar)
-        self.mpm.gradient_bar[p] += tensor.strain_adjoint(
+        self.mpm.gradient_bar[p] += isotropic.strain_adjoint(
             f, strain, log_j_bar + bar[0],
-            b_bar + bar[1] * tensor.identity3(), b_inverse_bar + bar[2] * tensor.identity3(),
+            b_bar + bar[1] * identity3(), b_inverse_bar + bar[2] * identity3(),
         )  # fmt: skip
 
     @ti.func
     def flow_particle_adjoint(self, t: ti.i32, s: ti.i32, p: ti.i32):
         """``gradient_bar`` -> ``trial_bar``."""
         trial, f = self.mpm.trial_gradient[s, p], self.mpm.deformation_gradient[s, p]
-        strain = tensor.isochoric_strain(trial)
-        before = tensor.invariants(strain)
+        strain = isotropic.isochoric_strain(trial)
+        before = isotropic.invariants(strain)
         cell, inside, slope = self.locate(self.features(before, self.strains[1]))
         flow = self.sample(self.flows, ti.Vector.zero(self.mpm.real, 2), cell, inside)
         share = self.share(flow)
-        share_bar, trial_bar, log_j_bar, b_bar, b_inverse_bar = tensor.neural_flow_adjoint(
+        share_bar, trial_bar, log_j_bar, b_bar, b_inverse_bar = isotropic.flow_adjoint(
             trial, strain, share, f, self.mpm.gradient_bar[p]
         )
         flow_bar = share_bar * (1.0 - share)
         feature_bar = self.sample_adjoint(self.flows, self.flows_bar, t, cell, inside, slope, flow_bar)
         bar, strain_bar = self.features_adjoint(before, self.strains[1], feature_bar)
-        self.mpm.trial_bar[p] = trial_bar + tensor.strain_adjoint(
+        self.mpm.trial_bar[p] = trial_bar + isotropic.strain_adjoint(
             trial, strain, log_j_bar + bar[0],
-            b_bar + bar[1] * tensor.identity3(), b_inverse_bar + bar[2] * tensor.identity3(),
+            b_bar + bar[1] * identity3(), b_inverse_bar + bar[2] * identity3(),
         )  # fmt: skip
         self.flow_strain_bar[p] += strain_bar
 

@@ -9,7 +9,7 @@ REAL = ti.f64
 
 @ti.data_oriented
 class PointKernels:
-    """functions: ``(x, v, held, t, dt, dx, c) -> v`` of effects on the grid, in order; widths: coefficients of each."""
+    """functions: of ``NodalEffect.node_velocity``, in order; widths: coefficients of each."""
 
     def __init__(self, functions, widths):
         self.members = tuple(zip(functions, widths, (sum(widths[:k]) for k in range(len(widths))), strict=True))
@@ -39,7 +39,7 @@ class PointKernels:
                     v += 0.5 * dt * g
                     for member in ti.static(self.members):
                         c = ti.Vector([coefficients[b, member[2] + i] for i in range(member[1])])
-                        v = member[0](x, v, v, t, dt, size, c)
+                        v = member[0](x, v, t, dt, size, c)
                     v += 0.5 * dt * g
                     x += 0.5 * dt * (before + v)
                 for i in ti.static(range(3)):

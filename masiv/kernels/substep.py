@@ -22,7 +22,7 @@ class SubstepKernels:
     def to_grid(self, t: ti.i32, s: ti.i32, count: ti.i32, nodes: ti.i32):
         """Law and P2G of chunk t of the particles."""
         for n in range(nodes):
-            self.mpm.private[t, n] = ti.Vector.zero(self.mpm.real, 4)
+            self.mpm.partial_grids[t, n] = ti.Vector.zero(self.mpm.real, 4)
         # Two loops: what a particle computes is one long chain, and a core works at several short ones at once.
         for p in range(t * count // self.mpm.chunks, (t + 1) * count // self.mpm.chunks):
             self.law.flow_particle(s, p)

@@ -11,7 +11,6 @@ differs from NeuMA: that adds low-rank matrices to the weights of a neural law, 
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -57,7 +56,7 @@ class AdapterLaw(Law):
         return REACH * torch.tanh(self.up(self.down(hidden)) / REACH)
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
-        """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
+        """Coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress`` from invariants (N, 3)."""
         factor = torch.exp(self.correction(invariants))
         g1, g2, kappa, coupling = base_moduli(self.base, invariants).unbind(1)
         return torch.stack([g1 * factor[:, 0], g2 * factor[:, 1], kappa * factor[:, 2], coupling * factor[:, 0]], dim=1)
@@ -120,7 +119,7 @@ class AdapterLaw(Law):
 
 
 def base_moduli(law: ClassicalLaw, invariants: torch.Tensor) -> torch.Tensor:
-    """A classical stress as coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress``.
+    """A classical stress as coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress``.
 
     Exact for neo-Hookean solids and fluids; of Hencky's strain, ln b is dev(b - b^-1) / (2 sqrt(1 + q/3)) to third
     order, q = (I1 + I2)/2 - 3.
@@ -179,20 +178,15 @@ def hencky_size(invariants: torch.Tensor) -> torch.Tensor:
     return torch.sqrt(torch.relu(square) / (1 + (first + second) / 6) / 16 + TINY**2)
 
 
-@functools.lru_cache(maxsize=8)
-def _adapter_kernels(mpm):
-    from masiv.kernels.laws import InvariantKernels
-
-    return InvariantKernels(mpm)
-
-
 class _BoundAdapter(BoundLaw):
     """Coefficients from torch between two kernels: invariants out, coefficients in."""
 
     def __init__(self, law: AdapterLaw, mpm: MpmKernels, count: int, dt: float) -> None:
+        from masiv.kernels.law_kernels import InvariantKernels
+
         self.law = law
         self.dt = dt
-        self.kernels = _adapter_kernels(mpm)
+        self.kernels = mpm.attached(InvariantKernels, lambda: InvariantKernels(mpm))
         self.trained = [p for p in law.parameters() if p.requires_grad]
         self.sums = [torch.zeros_like(p) for p in self.trained]
         dtype = law.hidden.weight.dtype

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -120,18 +119,13 @@ def _between(first: ClassicalLaw, second: ClassicalLaw, weight: float) -> dict[s
     }
 
 
-@functools.lru_cache(maxsize=8)
-def _kernels(mpm):
-    from masiv.kernels.pointwise import PointwiseKernels
-
-    return PointwiseKernels(mpm)
-
-
 class _BoundBlend(BoundLaw):
     """The definition itself, in torch, between the fields of the simulator."""
 
     def __init__(self, law: BlendedLaw, mpm: MpmKernels, count: int, dt: float) -> None:
-        self.kernels, self.dt = _kernels(mpm), dt
+        from masiv.kernels.pointwise import PointwiseKernels
+
+        self.kernels, self.dt = mpm.attached(PointwiseKernels, lambda: PointwiseKernels(mpm)), dt
         self.law = BlendedLaw(tabulated(law.first), tabulated(law.second), law.weight)
         self.trial = torch.empty(count, 3, 3, dtype=law.first.log_stress_scale.dtype)
 

@@ -1,8 +1,7 @@
-"""Classical laws with a few parameters. Formulas and sources: ``masiv.kernels.tensor``."""
+"""Classical laws with a few parameters. Formulas and sources: ``masiv.kernels.laws``."""
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 from typing import TYPE_CHECKING, Any
@@ -97,7 +96,7 @@ class ClassicalLaw(Law):
 
     def coefficients(self, dt: float) -> torch.Tensor:
         """What the kernels take in a substep of dt [s], shape (K,): see the ``c`` of each function in
-        ``masiv.kernels.tensor``."""
+        ``masiv.kernels.laws``."""
         mu, lam = self.elastic_moduli()
         if self.kind == "neo_hookean":
             return torch.stack([mu, lam])
@@ -174,7 +173,7 @@ class ClassicalLaw(Law):
 
 
 def isochoric_flow(f: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
-    """F (N, 3, 3) after a ``share`` of its isochoric Hencky strain has flowed: ``masiv.kernels.tensor.neural_flow``."""
+    """F (N, 3, 3) after a ``share`` of its isochoric Hencky strain has flowed: ``masiv.kernels.isotropic.flow``."""
     eye = torch.eye(3, dtype=f.dtype)
     b = torch.linalg.det(f)[:, None, None] ** (-2 / 3) * (f @ f.mT)
     b_inverse = torch.linalg.inv(b)
@@ -185,22 +184,17 @@ def isochoric_flow(f: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
     return torch.linalg.det(m)[:, None, None] ** (-1 / 3) * (m @ f)
 
 
-@functools.lru_cache(maxsize=8)
-def _classical_kernels(mpm, kind: str, coefficients: int):
-    from masiv.kernels.laws import ClassicalKernels
-
-    return ClassicalKernels(mpm, kind, coefficients)
-
-
 class _BoundClassical(SharedBoundLaw):
     def __init__(self, law: ClassicalLaw, mpm: MpmKernels, count: int, dt: float) -> None:
         self.law = law
         self.dt = dt
         self.mpm = mpm
         self.values = law.coefficients(dt)
-        self.kernels = _classical_kernels(mpm, law.kind, len(self.values))
-        dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
-        self.per_particle = self.values.detach().to(dtype).expand(count, -1).contiguous()
+        from masiv.kernels.law_kernels import ClassicalKernels
+
+        count_of = len(self.values)
+        self.kernels = mpm.attached((ClassicalKernels, law.kind), lambda: ClassicalKernels(mpm, law.kind, count_of))
+        self.per_particle = self.values.detach().to(mpm.torch_dtype).expand(count, -1).contiguous()
         self._own()
 
     def write(self) -> None:

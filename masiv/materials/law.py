@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +13,6 @@ from masiv.files import write_safetensors
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
     from masiv.kernels.substep import SubstepKernels
-
-
-@functools.lru_cache(maxsize=32)
-def _substeps(mpm, law, serial: bool) -> SubstepKernels:
-    from masiv.kernels.substep import SubstepKernels
-
-    return SubstepKernels(mpm, law, serial)
 
 
 class BoundLaw(ABC):
@@ -77,7 +69,9 @@ class SharedBoundLaw(BoundLaw):
         if mpm.gpu:
             return None
         self._own()
-        return _substeps(mpm, self.kernels, serial)
+        from masiv.kernels.substep import SubstepKernels
+
+        return mpm.attached((SubstepKernels, self.kernels, serial), lambda: SubstepKernels(mpm, self.kernels, serial))
 
     def backward(self, s: int, count: int) -> None:
         self._own()

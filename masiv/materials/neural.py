@@ -17,7 +17,6 @@ F once a substep, which ties the law to the substep.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 STRAIN_SCALE = 0.02
 LOG_MODULUS_RANGE = 6.0
 EVERY = 5
-"""Of the lattice's nodes, every which one ``departure`` looks at: no count of the lattice is a multiple of it."""
+"""Of the lattice's nodes, every which one ``prior_distance`` looks at: no count of the lattice is a multiple of it."""
 LOG_RATE_RANGE = 14.0  # relaxation rates of e^-14 to e^14 per second
 
 
@@ -121,10 +120,10 @@ class NeuralLaw(Law):
 
     def flow_table(self, dt: float) -> torch.Tensor:
         """-ln of the shares of isochoric and volumetric strain that a substep of dt [s] keeps, at the nodes, (K, 2)."""
-        return table.gentle(dt * torch.exp(self.rate_table()))
+        return table.lipschitz_envelope(dt * torch.exp(self.rate_table()))
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
-        """Coefficients (N, 4) [Pa] of ``masiv.kernels.tensor.neural_stress`` from invariants (N, 3)."""
+        """Coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress`` from invariants (N, 3)."""
         value = table.interpolate(self.moduli_table(), self.features(invariants, STRAIN_SCALE))
         return torch.cat([torch.exp(value[:, :3]), value[:, 3:]], dim=1)
 
@@ -152,7 +151,7 @@ class NeuralLaw(Law):
         pressure = 0.5 * kappa * (j - 1 / j) + coupling * (_trace(b) - 3)
         return g1 * _deviator(b) - g2 * _deviator(b_inverse) + pressure * eye
 
-    def departure(self, other: NeuralLaw) -> torch.Tensor:
+    def prior_distance(self, other: NeuralLaw) -> torch.Tensor:
         """Mean square difference () of the networks' outputs (log moduli relative to the stress scale, coupling, log
         rates) from those of ``other`` over the lattice of strain features; the scales do not count."""
         nodes = table.nodes(self.log_stress_scale.dtype)[::EVERY]
@@ -219,23 +218,18 @@ def _isochoric(f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tenso
     return j, b, torch.linalg.inv(b), torch.eye(3, dtype=f.dtype)
 
 
-@functools.lru_cache(maxsize=8)
-def _neural_kernels(mpm):
-    from masiv.kernels.neural import NeuralKernels
-
-    return NeuralKernels(mpm)
-
-
 class _BoundNeural(SharedBoundLaw):
     """The networks run once here; kernels interpolate their tables."""
 
     def __init__(self, law: NeuralLaw, mpm: MpmKernels, count: int, dt: float) -> None:
-        self.kernels = _neural_kernels(mpm)
+        from masiv.kernels.neural import NeuralKernels
+
+        self.kernels = mpm.attached(NeuralKernels, lambda: NeuralKernels(mpm))
         self.count = count
         self.parameters = tuple(law.parameters())
         with torch.enable_grad():
             self.tables = (law.moduli_table(), law.flow_table(dt), torch.exp(law.log_flow_strain))
-        self.dtype = torch.float64 if "f64" in str(mpm.real) else torch.float32
+        self.dtype = mpm.torch_dtype
         self._own()
 
     def write(self) -> None:

@@ -6,25 +6,25 @@ import functools
 
 import torch
 
-# Features: signed volume, size of the shear, kind of the shear (``NeuralLaw.features``). F = I is a node. Strains are
-# seen logarithmically, so the lattice reaches volume changes by e^4 and stretches by e^6.
-STEP = 0.25
-LOWER = (-6.0, 0.0, -1.0)
-COUNTS = (49, 33, 9)
+from masiv.kernels.lattice import LATTICE_COUNTS, LATTICE_LOWER, LATTICE_STEP
+
 ROUNDING = 1e-5
 
 
 @functools.lru_cache(maxsize=2)
 def nodes(dtype: torch.dtype) -> torch.Tensor:
     """Features (K, 3) of the nodes, the last axis fastest."""
-    axes = [low + STEP * torch.arange(count, dtype=dtype) for low, count in zip(LOWER, COUNTS, strict=True)]
+    axes = [
+        low + LATTICE_STEP * torch.arange(count, dtype=dtype)
+        for low, count in zip(LATTICE_LOWER, LATTICE_COUNTS, strict=True)
+    ]
     return torch.cartesian_prod(*axes)
 
 
 def interpolate(table: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
     """Values (N, C) of ``table`` (K, C) at features (N, 3), trilinear, constant beyond the lattice."""
-    counts = torch.tensor(COUNTS, dtype=features.dtype)
-    scaled = (features - torch.tensor(LOWER, dtype=features.dtype)) / STEP
+    counts = torch.tensor(LATTICE_COUNTS, dtype=features.dtype)
+    scaled = (features - torch.tensor(LATTICE_LOWER, dtype=features.dtype)) / LATTICE_STEP
     scaled = torch.minimum(scaled.clamp_min(0), counts - 1)
     cell = torch.minimum(scaled.detach().floor(), counts - 2)
     inside = scaled - cell
@@ -33,21 +33,21 @@ def interpolate(table: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
     for corner in torch.cartesian_prod(*[torch.arange(2)] * 3):
         weight = torch.where(corner.bool(), inside, 1 - inside).prod(1, keepdim=True)
         i, j, k = (cell + corner).unbind(1)
-        out = out + weight * table[(i * COUNTS[1] + j) * COUNTS[2] + k]
+        out = out + weight * table[(i * LATTICE_COUNTS[1] + j) * LATTICE_COUNTS[2] + k]
     return out
 
 
-def gentle(values: torch.Tensor) -> torch.Tensor:
+def lipschitz_envelope(values: torch.Tensor) -> torch.Tensor:
     """The largest table below ``values`` (K, C) that changes by no more than 1 for a unit of any feature.
 
     The lower envelope of cones with L1 distance, one sweep to and fro along each axis (Felzenszwalb & Huttenlocher
     2012). Where it cuts, the gradient goes to the node that a cone stands on.
     """
-    grid = values.reshape(*COUNTS, -1)
-    for axis, count in enumerate(COUNTS):
+    grid = values.reshape(*LATTICE_COUNTS, -1)
+    for axis, count in enumerate(LATTICE_COUNTS):
         shape = [1, 1, 1, 1]
         shape[axis] = count
-        ramp = STEP * torch.arange(count, dtype=values.dtype).reshape(shape)
+        ramp = LATTICE_STEP * torch.arange(count, dtype=values.dtype).reshape(shape)
         for _ in range(2):
             grid = (torch.cummin(grid - ramp, dim=axis).values + ramp).flip(axis)
     bound = grid.reshape(values.shape)

@@ -20,7 +20,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
 from masiv.models.families import Family
 from masiv.models.parameters import Parameter
 
@@ -91,7 +91,7 @@ def plain_term(name: str, context: EffectContext) -> EffectTerm:
     units = {f"{name}.{p.name}": p.unit for p in effect.parameters}
     cut = effect.strengths
     guesses = tuple(tuple(g) for g in effect.guesses(context))
-    return EffectTerm(name, name, own[:cut], own[cut:], guesses, units, nonsmooth=effect.nonsmooth)
+    return EffectTerm(name, name, own[:cut], own[cut:], guesses, units, nonsmooth=effect.hints.nonsmooth)
 
 
 class ForwardModel(ABC):

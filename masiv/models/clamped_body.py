@@ -17,7 +17,9 @@ from scipy.interpolate import CubicSpline
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
-from masiv.effects.effect import DragBody, Effect, EffectContext, EffectParameter
+from masiv.effects.context import EffectContext, EffectParameter
+from masiv.effects.effect import ClockEffect, ContactEffect, Effect, GeometryEffect
+from masiv.effects.per_body import DragBody
 from masiv.materials.classical import UNITS, ClassicalLaw
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model
 from masiv.models.cache import Arrays, RolloutCache
@@ -44,9 +46,9 @@ PHASE_LOST = 1.2
 """Residual over the swing about its mean from which the phase is lost; of two swings in step it is less than 1."""
 PLACE_MARGIN = 0.15
 """How far from the body, in lengths of it, something that acts on it from outside may be."""
-NOT_SIMULATED = frozenset({"ground_height", "time_offset"})
-"""Effects that are no candidates: a clock that is off is a release at another time, and a body that rests in its clamp
-does not move with the ground."""
+NOT_SIMULATED = (GeometryEffect, ClockEffect)
+"""Effects that are no candidates: a body that rests in its clamp does not move with the ground, and a clock that is off
+is a release at another time."""
 MAX_MASS, MASS_STEP, FORCE_STEP, LENGTH_STEP = 30.0, 0.05, 0.05, 0.04
 """Bound and finite-difference step of a mass in masses of the body, step of a force in its weights and of a length in
 its sizes."""
@@ -150,24 +152,25 @@ class ClampedBodyModel(ForwardModel):
         """Effects that ``model`` lacks: at most one contact with the ground, none without a ground, those that need a
         clamp if there is one, none of ``NOT_SIMULATED``."""
         no_ground = self.tracks.ground is None
-        taken = no_ground or any(effect_named(n).on_grid == "ground" for n in model.effects)
+        taken = no_ground or any(isinstance(effect_named(n), ContactEffect) for n in model.effects)
         clamped = self.body(self.observations[0]).is_clamped
         return [
             name
             for name, effect in causes().items()
             if name not in model.effects
-            and name not in NOT_SIMULATED
-            and not (effect.on_grid == "ground" and taken)
-            and not (effect.needs_clamp and not clamped)
+            and not isinstance(effect, NOT_SIMULATED)
+            and not (isinstance(effect, ContactEffect) and taken)
+            and not (effect.hints.needs_clamp and not clamped)
         ]
 
     def term(self, name: str) -> EffectTerm:
         """The effect, its steps in proportion to the body."""
         effect = effect_named(name)
-        own = [self._parameter(effect, p) for p in effect.shared or effect.parameters]
+        declared = (effect.per_body or effect).parameters
+        own = [self._parameter(effect, p) for p in declared]
         cut = effect.strengths
         guesses = tuple(tuple(g) for g in effect.guesses(self._context(self.observations[0])))
-        units = {f"{name}.{p.name}": p.unit for p in effect.shared or effect.parameters}
+        units = {f"{name}.{p.name}": p.unit for p in declared}
         return EffectTerm(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
 
     def _parameter(self, effect: Effect, p: EffectParameter) -> Parameter:
@@ -183,7 +186,7 @@ class ClampedBodyModel(ForwardModel):
         elif p.unit == "m":
             step = LENGTH_STEP * size
             if p.name in "xyz":  # a place is in the body or at it
-                k, reach = "xyz".index(p.name), 0.0 if effect.inside else PLACE_MARGIN * size
+                k, reach = "xyz".index(p.name), 0.0 if effect.hints.inside else PLACE_MARGIN * size
                 lower, upper = float(low[k]) - reach, float(high[k]) + reach
         return Parameter(f"{effect.name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
 
@@ -214,7 +217,7 @@ class ClampedBodyModel(ForwardModel):
         for name in model.effects:
             effect = effect_named(name)
             given = torch.tensor([both[p.name] for p in self.term(name).parameters], dtype=torch.float32)
-            members.append((effect, effect.of(given, self.drag_body) if effect.shared else given))
+            members.append((effect, effect.per_body.of_body(given, self.drag_body) if effect.per_body else given))
         body = self.body(run)
         return body.effects(members, body.context(duration, float(np.median(np.diff(run.times)))))
 
@@ -229,7 +232,7 @@ class ClampedBodyModel(ForwardModel):
             substep = self.substep(run, model, values, times)
             effects = self.acting(run, model, values, last)
             acting = [(effect.name, theta) for effect, theta in effects.members]
-            context = effects.setting
+            context = effects.context
             key = (
                 body.digest, body.contact, body.attachment, law.kind, sorted(law.values.items()), acting,
                 context.duration, context.frame_time, deflection, times, substep,
@@ -292,5 +295,6 @@ class ClampedBodyModel(ForwardModel):
     def objections(self, before: FittedModel, after: FittedModel, term: EffectTerm, min_gain: float) -> list[str]:
         """What the medium cannot do."""
         theta = torch.tensor([after.values[p.name] for p in term.parameters], dtype=torch.float64)
-        why = effect_named(term.effect).violates_bounds(theta, self.drag_body)
+        per_body = effect_named(term.effect).per_body
+        why = per_body.violates_bounds(theta, self.drag_body) if per_body else None
         return [] if why is None else [why]

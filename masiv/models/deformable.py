@@ -10,15 +10,17 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from masiv.effects._clamp import clamped
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import Effect, EffectContext
+from masiv.effects.boundary.clamp import with_clamp
+from masiv.effects.context import EffectContext
+from masiv.effects.effect import Effect
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.law import Law
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import rollout
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.observations.identity import content_hash
 from masiv.scene.transforms import SimulationFrame
 
@@ -90,7 +92,7 @@ class DeformableBody:
     def effects(self, members: Sequence[tuple[Effect, torch.Tensor]], context: EffectContext) -> ActiveEffects:
         """Effects with their parameters, and after them the clamp."""
         active = ActiveEffects(tuple(members), context)
-        return clamped(active, self.normals, self.heights) if self.is_clamped else active
+        return with_clamp(active, self.normals, self.heights) if self.is_clamped else active
 
     def substeps(self, law: Law, interval: float) -> int:
         """The fewest equal substeps in ``interval`` [s] that ``law`` is stable with. Raises MasivError if those are too

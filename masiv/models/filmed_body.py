@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import Effect, EffectContext
+from masiv.effects.context import EffectContext
+from masiv.effects.effect import Effect
 from masiv.materials.law import Law
 from masiv.models.deformable import DeformableBody, HeldSubsteps
 from masiv.models.initial_state import InitialState, rigid_initial_state

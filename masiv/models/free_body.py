@@ -10,6 +10,7 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
+from masiv.effects.effect import ContactEffect
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model, effect_parameters, plain_term
 from masiv.models.cache import RolloutCache
 from masiv.models.deformable import HeldSubsteps, failures_as_divergence
@@ -68,7 +69,7 @@ class FreeBodyModel(ForwardModel):
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
         """Grid corrections, law, initial states, effects. Grid corrections come first: their derivatives need no other
         rollout than the one before."""
-        gone = {effect_named(name).replaces_parameter for name in model.effects}
+        gone = {effect_named(name).hints.replaces_parameter for name in model.effects}
         own = [
             replace(p, name=f"{p.name}@{e.name}")
             for e, r in zip(self.observations, self.setups, strict=True)
@@ -91,14 +92,14 @@ class FreeBodyModel(ForwardModel):
         """Effects that ``model`` lacks: at most one contact with the ground, none without a ground, and none that needs
         a clamp."""
         library = causes()
-        taken = model.contact == "none" or any(effect_named(n).on_grid == "ground" for n in model.effects)
-        apart = (*model.effects, *(n for n, e in library.items() if e.needs_clamp))
-        return [n for n, e in library.items() if n not in apart and not (taken and e.on_grid == "ground")]
+        taken = model.contact == "none" or any(isinstance(effect_named(n), ContactEffect) for n in model.effects)
+        apart = (*model.effects, *(n for n, e in library.items() if e.hints.needs_clamp))
+        return [n for n, e in library.items() if n not in apart and not (taken and isinstance(e, ContactEffect))]
 
     def term(self, name: str) -> EffectTerm:
         """The effect on everything; its guesses are from the fitted frames of the first recording."""
         term = plain_term(name, self.setups[0].body.context(self.observations[0].fit_frames))
-        instead = effect_named(name).replaces_parameter
+        instead = effect_named(name).hints.replaces_parameter
         replaced = () if instead is None else tuple(f"{instead}@{e.name}" for e in self.observations)
         return replace(term, replaces_parameter=replaced)
 
@@ -131,7 +132,7 @@ class FreeBodyModel(ForwardModel):
         theta = torch.tensor([after.values[p.name] for p in term.parameters])
         times = [e.fit_frames / r.body.scene.fps for e, r in zip(self.observations, self.setups, strict=True)]
         places = torch.cat([torch.as_tensor(e.seen_at_frames()).reshape(-1, 3) for e in self.observations])
-        reason = effect_named(term.effect).identifiability_issue(theta, max(times), places)
+        reason = effect_named(term.effect).hints.identifiability_issue(theta, max(times), places)
         return [] if reason is None else [reason]
 
     def active(self, model: Model, values: Mapping[str, float], body: FilmedBody) -> ActiveEffects | None:

@@ -10,7 +10,7 @@ import torch
 
 from masiv.models.parameters import Parameter
 from masiv.mpm.rollout import at_rest
-from masiv.mpm.simulator import State
+from masiv.mpm.state import State
 from masiv.rigid import beyond_rigid, first_contact_frame, free_flight
 from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame

@@ -17,7 +17,7 @@ from masiv.models.deformable import DeformableBody, checked_instants
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest
-from masiv.mpm.simulator import State
+from masiv.mpm.state import State
 from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import fill_geometry

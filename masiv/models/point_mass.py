@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from masiv.effects.catalogue import causes, effect_named
-from masiv.effects.effect import Effect, EffectContext, EffectParameter
+from masiv.effects.context import EffectContext, EffectParameter
+from masiv.effects.effect import Effect, NodalEffect
 from masiv.errors import NonFiniteError
 from masiv.kernels.points import point_kernels
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model, plain_term
@@ -96,12 +97,14 @@ class PointMassModel(ForwardModel):
         """Effects of the surroundings once; those that depend on the body once for all, and once a body."""
         out, taken = [], [self.term(name) for name in model.effects]
         for name, effect in causes().items():
-            if effect.on_grid != "nodes" or any(p.unit == "m" for p in effect.parameters[effect.strengths :]):
+            at_place = any(p.unit == "m" for p in effect.parameters[effect.strengths :])
+            if at_place or not isinstance(effect, NodalEffect):
                 continue  # what acts at a place is not told by a point that passes it once
             has = [t for t in taken if t.effect == name]
             if not has:
                 out.append(self.made(name, ()).name)
-            if effect.per_body and len(self.bodies) > 1 and all(t.bodies for t in has):
+            differs = effect.per_body is not None and effect.per_body.differs_by_body
+            if differs and len(self.bodies) > 1 and all(t.bodies for t in has):
                 held = {b for t in has for b in t.bodies}
                 fitted = {run.body for run in self.observations if run.fitted}
                 alone = [b for b in self.bodies if b not in held and b in fitted]
@@ -119,7 +122,7 @@ class PointMassModel(ForwardModel):
             scope = EACH if bodies == self.bodies else f"{EACH} of {scope}"
         name = f"{effect}@{scope}" if bodies else effect
         if name not in self.terms:
-            shared: tuple[EffectParameter, ...] = known.shared or known.parameters
+            shared: tuple[EffectParameter, ...] = (known.per_body or known).parameters
             cut = known.strengths
             own = [
                 (f"{name}.{p.name}{'' if body is None else f' of {body}'}", p)
@@ -159,7 +162,7 @@ class PointMassModel(ForwardModel):
             for term in (self.term(n) for n in model.effects):
                 if term.effect == name and (not term.bodies or run.body in term.bodies):
                     given = torch.tensor([values[p.name] for p in self.own(term, run.body)], dtype=torch.float64)
-                    theta = effect.of(given, self.drag_bodies[run.body])
+                    theta = effect.per_body.of_body(given, self.drag_bodies[run.body]) if effect.per_body else given
             if theta is None:
                 absent = [0.0 if k < effect.strengths else p.start for k, p in enumerate(effect.parameters)]
                 theta = torch.tensor(absent, dtype=torch.float64)
@@ -232,7 +235,8 @@ class PointMassModel(ForwardModel):
     def _impossible(self, fitted: FittedModel, term: EffectTerm, body: str) -> str | None:
         """What the medium cannot do to ``body``."""
         theta = torch.tensor([fitted.values[p.name] for p in self.own(term, body)], dtype=torch.float64)
-        return effect_named(term.effect).violates_bounds(theta, self.drag_bodies[body])
+        per_body = effect_named(term.effect).per_body
+        return per_body.violates_bounds(theta, self.drag_bodies[body]) if per_body else None
 
 
 def fly(

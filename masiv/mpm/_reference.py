@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from masiv.materials.law import Law
-from masiv.mpm.simulator import State
+from masiv.mpm.state import State
 
 
 def _substep(state: State, law: Law, *, mass, volume, spacing, substep, gravity, contact) -> State:

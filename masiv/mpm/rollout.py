@@ -6,7 +6,9 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.materials.law import Law
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
+from masiv.mpm.taped_rollout import Adjoint, TapedRollout
 
 
 class _Rollout(torch.autograd.Function):
@@ -18,32 +20,34 @@ class _Rollout(torch.autograd.Function):
     ):
         state = State(position, velocity, affine_velocity, trial_gradient)
         with torch.enable_grad():  # from parameters of effects to coefficients of kernels
-            ctx.effects = _leaves(effects) if effects is not None else None
-            ctx.recording = simulator.run(state, law, steps, outputs, ctx.effects)
+            ctx.effects = _detached(effects) if effects is not None else None
+            ctx.taped = simulator.run(state, law, steps, outputs, ctx.effects)
         ctx.dtypes = [t.dtype for t in state.tensors()]
-        return ctx.recording.positions
+        return ctx.taped.positions
 
     @staticmethod
     def backward(ctx, positions_bar):
         with torch.enable_grad():  # laws differentiate their networks inside
-            adjoint = ctx.recording.backward(positions_bar)
+            adjoint = ctx.taped.backward(positions_bar)
         bars = [bar.to(dtype) for bar, dtype in zip(adjoint.state.tensors(), ctx.dtypes, strict=True)]
-        return None, None, None, None, None, *bars, *adjoint.law, *_through(ctx.recording, ctx.effects, adjoint)
+        return None, None, None, None, None, *bars, *adjoint.law, *_effect_gradients(ctx.taped, ctx.effects, adjoint)
 
 
-def _leaves(effects: ActiveEffects) -> ActiveEffects:
+def _detached(effects: ActiveEffects) -> ActiveEffects:
     members = tuple((effect, theta.detach().clone().requires_grad_()) for effect, theta in effects.members)
-    return ActiveEffects(members, effects.setting)
+    return ActiveEffects(members, effects.context)
 
 
-def _through(recording, effects: ActiveEffects | None, adjoint) -> list[torch.Tensor | None]:
-    """Adjoints of the effects' parameters, from those of coefficients, masses and forces."""
+def _effect_gradients(
+    taped: TapedRollout, effects: ActiveEffects | None, adjoint: Adjoint
+) -> list[torch.Tensor | None]:
+    """Gradients of the effects' parameters, from the adjoints of coefficients, masses and forces."""
     if effects is None:
         return []
-    outputs = [*recording.coefficients, recording.mass]
+    outputs = [*taped.effects.coefficients, taped.mass]
     bars = [*adjoint.coefficients, adjoint.mass]
-    if recording.force is not None:
-        outputs.append(recording.force)
+    if taped.effects.force is not None and adjoint.force is not None:
+        outputs.append(taped.effects.force)
         bars.append(adjoint.force)
     used = [(o, b.to(o.dtype)) for o, b in zip(outputs, bars, strict=True) if o.requires_grad]
     if not used:

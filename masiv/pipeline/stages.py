@@ -124,11 +124,10 @@ def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, pro
     """
     if run.fit_frames >= scene.frame_count:
         return None
-    from masiv.continuum.extend import extend_trajectory
+    from masiv.continuum.extend_trajectory import extend_trajectory
     from masiv.continuum.trajectory import Trajectory
     from masiv.splat.dynamic import DynamicGaussians
-    from masiv.splat.follow import follow
-    from masiv.splat.follow_config import FollowConfig
+    from masiv.splat.extend_frames import ExtendFramesConfig, extend_frames
 
     folder = run.path / "held_out"
     path = folder / "trajectory.npz"
@@ -140,11 +139,11 @@ def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, pro
     folder.mkdir(exist_ok=True)
     checkpoint = run.checkpoint("held_out_gaussians")
     if not (folder / "deformation.safetensors").is_file():
-        extended = follow(
+        extended = extend_frames(
             visible,
             load_gaussians(run),
             config.reconstruct,
-            FollowConfig.model_validate({}),
+            ExtendFramesConfig.model_validate({}),
             seed=config.seed,
             checkpoint=checkpoint,
             progress=progress,
@@ -169,12 +168,12 @@ def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, pro
 @contextmanager
 def material_description(run: RunFolder, config: Config, twin: Twin) -> Iterator[None]:
     """Write material.json, if it is missing, in a second process while the body of this context runs."""
-    from masiv.workers import Workers, processes_wanted, unwrap
+    from masiv.workers import Workers, process_count, unwrap
 
     if (run.path / MATERIAL).is_file():
         yield
         return
-    with Workers(min(2, processes_wanted(config.identify.processes)), "identify.processes") as workers:
+    with Workers(min(2, process_count(config.identify.processes)), "identify.processes") as workers:
         wait = workers.submit(describe_material, (run, twin))
         yield
         unwrap(wait())

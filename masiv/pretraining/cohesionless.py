@@ -4,7 +4,7 @@ One throw shows little of a cone: whether matter flows depends on the ratio of t
 taught on the states of a throw alone (as the others are) held no slope at all. So strains are sampled over the lattice
 of the law, more of them near the cone, and the networks learn where the classical law flows and where it does not: at
 least a rate within which a substep loses everything there, at most a rate that no film shows here. What lies between is
-bounded by ``table.gentle``: the steepest law is perfect plasticity, which is what a cone is.
+bounded by ``table.lipschitz_envelope``: the steepest law is perfect plasticity, which is what a cone is.
 """
 
 from __future__ import annotations

@@ -18,7 +18,8 @@ from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.neural import NeuralLaw, strain_invariants
 from masiv.mpm.rollout import at_rest, rollout
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.pretraining import cohesionless
 from masiv.progress import Progress, silent
 

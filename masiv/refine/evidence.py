@@ -87,7 +87,7 @@ def statistical_objections(
 def parameters_at_bounds(after: ModelFit, term: EffectTerm) -> list[str]:
     """Which parameters of ``term`` ran into the bound of what is possible, as objections."""
     # What acts on the matter at a place may well be at the body's face, where its place ends.
-    bounded = term.strengths if effect_named(term.effect).inside else term.parameters
+    bounded = term.strengths if effect_named(term.effect).hints.inside else term.parameters
     return [
         f"{p.name} runs into the bound of what is possible, {p.upper:g}"
         for p in bounded

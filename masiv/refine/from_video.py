@@ -20,7 +20,7 @@ from masiv.refine.result import RefineResult
 from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import check_effects, refine
 from masiv.scene.scene import Scene
-from masiv.workers import Workers, processes_wanted
+from masiv.workers import Workers, process_count
 
 COMPETITORS = {
     "jelly": ("neo_hookean", "von_mises"),
@@ -82,7 +82,7 @@ def refine_recordings(
     start = RENAMED_STARTS.get(start or "", start)
     if not config.laws and start in COMPETITORS:
         config = config.model_copy(update={"laws": list(COMPETITORS[start])})
-    with runtime.torch_threads(1), Workers(processes_wanted(config.processes)) as workers:
+    with runtime.torch_threads(1), Workers(process_count(config.processes)) as workers:
         prepared = [
             prepare(r.name, r.scene, first_frames(r.motion, r.fit_frames), r.whole, identify, simulator, config)
             for r in with_unique_names(recordings)

@@ -18,7 +18,7 @@ def map_tasks(
     workers: Workers, forward_model: ForwardModel, function: Callable, tasks: Iterable[tuple]
 ) -> Iterator[Any]:
     """``function(forward_model, *task)`` of each task, in order, or ``TaskError``; rollouts are counted."""
-    for result, rollouts in workers.map(_counted, [(function, forward_model, *task) for task in tasks]):
+    for result, rollouts in workers.map(_counted, tasks, shared=(function, forward_model)):
         forward_model.rollouts += rollouts
         yield result
 

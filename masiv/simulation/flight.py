@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from masiv.effects.effect import EffectContext
+from masiv.effects.context import EffectContext
+from masiv.effects.effect import NodalEffect
 from masiv.errors import InputError, NonFiniteError
 from masiv.models.point_mass import fly
 from masiv.scene.transforms import SimulationFrame
@@ -43,7 +44,7 @@ def _flight(
     )  # fmt: skip
     members = []
     for effect, theta in effect_members(twin, body, torch.float64):
-        if effect.on_grid != "nodes":
+        if not isinstance(effect, NodalEffect):
             raise InputError(f"effect {effect.name} does not act on a rigid body: leave it out with --without")
         members.append((effect, effect.coefficients(theta, context).numpy()))
     begin = np.stack([start.placement.translation, start.velocity if velocity is None else velocity])[None]

@@ -13,7 +13,8 @@ from masiv.effects.active import ActiveEffects
 from masiv.errors import InputError, NonFiniteError
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import at_rest
-from masiv.mpm.simulator import Simulator, State
+from masiv.mpm.simulator import Simulator
+from masiv.mpm.state import State
 from masiv.progress import Progress, silent
 from masiv.scene.transforms import SimulationFrame
 from masiv.simulation.force import ForcePulse

@@ -7,7 +7,8 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.effects.effect import Effect, EffectContext
+from masiv.effects.context import EffectContext
+from masiv.effects.effect import Effect, GridEffect
 from masiv.errors import InputError
 from masiv.scene.transforms import SimulationFrame
 from masiv.twin import Body, Twin
@@ -29,10 +30,10 @@ def effect_members(
             continue
         known = effect_named(effect.name)
         theta = torch.tensor([effect.values[p.name] for p in effect.parameters], dtype=dtype)
-        if effect.shared:
+        if effect.shared and known.per_body is not None:
             if body.drag is None:
                 raise InputError(f"effect {effect.name}: the diameter and the medium of body {body.name} are not known")
-            theta = known.of(theta, body.drag)
+            theta = known.per_body.of_body(theta, body.drag)
         members.append((known, theta))
     return tuple(members)
 
@@ -67,12 +68,12 @@ def shift_effects(effects: ActiveEffects, by: torch.Tensor) -> ActiveEffects:
     members = []
     for effect, theta in effects.members:
         names = [p.name for p in effect.parameters]
-        if effect.on_grid is not None and "y" in names:
+        if isinstance(effect, GridEffect) and "y" in names:
             height = torch.zeros_like(theta)
             height[names.index("y")] = 1.0
             theta = theta - height * by
         members.append((effect, theta))
-    return ActiveEffects(tuple(members), effects.setting)
+    return ActiveEffects(tuple(members), effects.context)
 
 
 def mass_ratio(effects: ActiveEffects | None) -> float:

@@ -97,9 +97,9 @@ def _up(twin: Twin) -> np.ndarray:
 def _over_new_ground(effects: tuple[TwinEffect, ...], lift: float) -> tuple[TwinEffect, ...]:
     """``effects`` over a ground that is lower by ``lift`` [m]: places (parameters x, y, z [m]) keep their height."""
     from masiv.effects.catalogue import effect_named
-    from masiv.effects.effect import Effect
+    from masiv.effects.effect import GeometryEffect
 
-    kept = (e for e in effects if type(effect_named(e.name)).ground_shift is Effect.ground_shift)
+    kept = (e for e in effects if not isinstance(effect_named(e.name), GeometryEffect))
     return tuple(replace(e, values={**e.values, "y": e.values["y"] + lift}) if "y" in e.values else e for e in kept)
 
 

@@ -1,4 +1,4 @@
-"""Where every point of the object is at time t: a low-rank motion field (MASIV: mu_t = mu* + w(mu*, t) B(t))."""
+"""Displacement of every point of the object at time t: a low-rank motion field (MASIV: mu_t = mu* + w(mu*, t) B(t))."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from masiv.files import write_safetensors
 class DeformationNetwork(torch.nn.Module):
     """Displacement d(x, t) = s(t) - s(0) + sum_b w_b(x, t) (B_b(t) - B_b(0)) of a point that is at x at frame 0.
 
-    s is a cubic spline through ``base_motion``, the object's translation at each frame; the bases B carry what is left.
-    differs from MASIV: d(x, 0) = 0 by construction, so the canonical shape *is* frame 0 and a trajectory starts where
-    its point is; activations are smooth and the highest time frequency is half of what the frames can carry, so that
-    the network can be asked between frames.
+    s is a cubic spline through ``base_motion``, the object's translation at each frame; the bases B add the rest.
+    Two things differ from MASIV. d(x, 0) = 0 by construction: the canonical shape is the shape at frame 0. The motion
+    can be evaluated between frames: activations are smooth, and the highest frequency of the time encoding is half of
+    the Nyquist frequency of the frames.
 
-    The base motion is learnable: a frame's translation is its best observed parameter, and a network that had to
-    correct the error of a rough first guess would have to wiggle from frame to frame to do it.
+    The base motion is learnable. The translation of a frame is well observed, and a network that had to correct errors
+    of a fixed base motion would oscillate from frame to frame.
 
     centre (3,) [m] and half_extent [m] scale positions to about [-1, 1]; base_motion (T, 3) [m], T = frame_count >= 2;
     fps [1/s]; bases = B; width and depth of the hidden layers; octaves of the positional encodings (time_octaves is an
-    upper limit, see ``time_octave_limit``).
+    upper limit, see ``time_octave_limit``). Raises InputError for values that are not finite or do not match.
     """
 
     def __init__(
@@ -73,16 +73,18 @@ class DeformationNetwork(torch.nn.Module):
         self.space_input = torch.nn.Linear(3 + 6 * space_octaves, width)
         self.time_input = torch.nn.Linear(time_size, width, bias=False)
         self.coefficients = _mlp(width, width, depth - 1, bases)
-        # No motion at first: zero bases, and weights that differ, so that the bases can come apart.
+        # No motion at first: the bases are zero. The weights differ, so that the bases can become different.
         torch.nn.init.zeros_(self.motion[-1].weight)
         torch.nn.init.zeros_(self.motion[-1].bias)
 
     @property
     def frame_count(self) -> int:
+        """Frames T of the motion."""
         return self.settings["frame_count"]
 
     @property
     def fps(self) -> float:
+        """Frames per second [1/s]."""
         return self.settings["fps"]
 
     def forward(self, positions: torch.Tensor, time: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -101,7 +103,7 @@ class DeformationNetwork(torch.nn.Module):
         return moved[..., :3], moved[..., 3]
 
     def base_displacements(self, times: torch.Tensor) -> torch.Tensor:
-        """The base motion's share of a displacement at ``times`` (K,) [s]: (K, 3) [m]."""
+        """Displacement (K, 3) [m] of the base motion at ``times`` (K,) [s]."""
         return self._base(times * self.fps) - self.base_motion[0]
 
     def _evaluate(self, positions: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
@@ -135,7 +137,7 @@ class DeformationNetwork(torch.nn.Module):
 
     @classmethod
     def load(cls, path: Path) -> DeformationNetwork:
-        """Read what ``save`` wrote. Raises InputError where ``path`` is missing or is something else."""
+        """Read what ``save`` wrote. Raises InputError if ``path`` is missing or another file."""
         try:
             with safe_open(path, framework="pt") as file:
                 settings = json.loads((file.metadata() or {})["masiv_deformation"])
@@ -148,9 +150,9 @@ class DeformationNetwork(torch.nn.Module):
 
 
 def time_octave_limit(frame_count: int) -> int:
-    """How many octaves sin(2^k pi tau), tau in [0, 1] over ``frame_count`` frames, stay within half of Nyquist.
+    """How many octaves sin(2^k pi tau), tau in [0, 1] over ``frame_count`` frames, are below half of Nyquist.
 
-    Octave k makes 2^k / 2 turns over the frames and Nyquist allows (T - 1) / 2; half of it leaves room for the
+    Octave k has 2^k / 2 periods over the frames, and the Nyquist limit is (T - 1) / 2. The other half is left for the
     harmonics that the hidden layers add.
     """
     return max(0, math.floor(math.log2((frame_count - 1) / 2)) + 1)

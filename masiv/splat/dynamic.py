@@ -1,4 +1,4 @@
-"""The result of ``reconstruct``: Gaussians at frame 0 and where they go."""
+"""The result of ``reconstruct``: Gaussians at frame 0 and their motion."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class DynamicGaussians:
 
     @classmethod
     def load(cls, folder: Path) -> DynamicGaussians:
-        """Read what ``save`` wrote. Raises InputError where a file is missing or broken."""
+        """Read what ``save`` wrote. Raises InputError if a file is missing or broken."""
         folder = Path(folder)
         return cls(
             Gaussians.load_ply(folder / "gaussians.ply"), DeformationNetwork.load(folder / "deformation.safetensors")

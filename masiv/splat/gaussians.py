@@ -1,4 +1,4 @@
-"""Isotropic 3D Gaussians and their file: the PLY layout of Kerbl et al. 2023, which every 3DGS viewer opens."""
+"""Isotropic 3D Gaussians and their file, in the PLY layout of Kerbl et al. 2023 that viewers of 3DGS read."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from masiv.files import atomic
 _SH_DEGREE_0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 1/2 + _SH_DEGREE_0 f_dc."""
 _OPACITY_MARGIN = 1e-6
-"""A file holds logits, which are infinite at 0 and 1."""
+"""Opacities are stored as logits, which are infinite at 0 and 1."""
 _COLUMNS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
@@ -25,7 +25,7 @@ _COLUMNS = (
 @dataclass(frozen=True)
 class Gaussians:
     """means (N, 3) [m, world]; scales (N,) standard deviations [m] > 0; opacities (N,) in [0, 1]; colours (N, 3) RGB,
-    1 is white. Float tensors, values as drawn (after any activation)."""
+    1 is white. Float tensors, after any activation."""
 
     means: torch.Tensor
     scales: torch.Tensor
@@ -36,7 +36,7 @@ class Gaussians:
         return len(self.means)
 
     def save_ply(self, path: Path) -> None:
-        """Write ``path`` (float32, binary PLY) through a temporary name. Raises MasivError for non-finite values."""
+        """Write ``path`` (float32, binary PLY) completely or not at all. Raises MasivError for non-finite values."""
         count = len(self)
         columns: dict[str, np.ndarray] = {name: np.zeros(count) for name in _COLUMNS}
         means, colours = self.means.detach().cpu().numpy(), self.colours.detach().cpu().numpy()
@@ -57,7 +57,7 @@ class Gaussians:
 
     @classmethod
     def load_ply(cls, path: Path) -> Gaussians:
-        """Read a file in the 3DGS layout. Raises InputError where it is missing, broken or anisotropic."""
+        """Read a file in the 3DGS layout. Raises InputError if it is missing, broken or anisotropic."""
         try:
             rows = PlyData.read(str(path))["vertex"].data
             columns = {name: np.asarray(rows[name], dtype=np.float64) for name in _COLUMNS if name[0] != "n"}

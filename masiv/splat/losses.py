@@ -1,4 +1,4 @@
-"""What a reconstruction is judged by: SSIM of small pictures, and how much neighbours stretch."""
+"""Terms of the reconstruction loss: SSIM of small images, and strain between neighbours."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 def ssim(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Structural similarity (Wang et al. 2004) of pictures (H, W, C) in [0, 1], a scalar; window 11, sigma 1.5.
+    """Structural similarity (Wang et al. 2004) of images (H, W, C) in [0, 1], a scalar; window 11, sigma 1.5 pixels.
 
-    Pictures here are small, so the blur is two products with banded matrices, cheaper than a convolution. The window is
-    cut and renormalised at the border. What depends on ``other`` alone is blurred apart: it mostly has no gradient.
+    The blur is two products with banded matrices, which is faster than a convolution for small images. At the border
+    the window is cut and renormalized. ``other`` is blurred separately, since it usually has no gradient.
     """
     height, width, _ = one.shape
     rows, columns = _blur(height, one.dtype), _blur(width, one.dtype)
@@ -38,12 +38,14 @@ def _blur(size: int, dtype: torch.dtype) -> torch.Tensor:
 
 
 Pairs = tuple[torch.Tensor, ...]
-"""As ``neighbour_pairs`` gives them, or their two ends alone."""
+"""As ``neighbour_pairs`` returns them, or their two ends only."""
 
 
 def neighbour_pairs(points: np.ndarray, count: int) -> Pairs:
-    """Each point and its ``count`` nearest others, as pairs: both ends, two (P,) int64, and how many of the two have
-    the other as a neighbour, (P,) float32. Most have each other, and a stretch is the same from both ends."""
+    """Pairs of each of the ``points`` (N, 3) and its ``count`` nearest others, without duplicates.
+
+    Returns both ends, (P,) int64 each, and the multiplicity (P,) float32: 2 if each is near the other, else 1.
+    """
     count = min(count, len(points) - 1)
     found = cKDTree(points).query(points, k=count + 1)[1][:, 1:]
     ends = np.sort(np.stack([np.repeat(np.arange(len(points)), count), found.ravel()], axis=1), axis=1)
@@ -63,8 +65,8 @@ def strain(
 ) -> torch.Tensor:
     """Mean squared relative change of length between neighbours, a scalar: 0 for a rigid motion.
 
-    rest (N, 3), displacement (..., N, 3) [m]; first, second (P,) ends of the pairs, which count ``times`` (once where
-    None); softening [m] is added to the rest length, so that two Gaussians that nearly coincide do not rule the sum.
+    rest (N, 3), displacement (..., N, 3) [m]; first, second (P,): ends of the pairs; times (P,): their multiplicity, 1
+    if None. softening [m] is added to the rest length and limits the term of two Gaussians that nearly coincide.
     """
     before = rest[second] - rest[first]
     after = before + displacement[..., second, :] - displacement[..., first, :]

@@ -1,4 +1,4 @@
-"""What a reconstruction minimises: pictures (MASIV's dynamic-Gaussian loss) and what keeps points from sliding."""
+"""The loss of a reconstruction: images (MASIV's dynamic-Gaussian loss) and regularization of the motion."""
 
 from __future__ import annotations
 
@@ -11,77 +11,87 @@ import torch
 from masiv.scene.scene import Ground
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
+from masiv.splat.hull_loss import HullLoss
 from masiv.splat.losses import Pairs, ssim, strain
 from masiv.splat.observed_image import ObservedImage
-from masiv.splat.pull import HullPull
 from masiv.splat.rasteriser import render
 
-NAMES = ("means", "log_scales", "opacity_logits", "colour_logits")
-"""The Gaussians' parameters."""
-PULLED = 700
-"""Gaussians, and points of a hull, that one step measures."""
+PARAMETER_NAMES = ("means", "log_scales", "opacity_logits", "colour_logits")
+"""The parameters of the Gaussians."""
+HULL_SAMPLES = 700
+"""Gaussians, and surface points of a hull, that one step compares."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a step's loss, whose random numbers are drawn. pictures: (frame, which of its observations, background
-    (3,)), frames ascending, ``of_pictures`` in the step; measured: frames whose strain and ground count here, of
-    ``of_frames``; pulled: Gaussians and points of the last frame's hull, and the pull's weight; sizes: whether the mean
-    size counts here."""
+    """A part of the loss of one step, with its random numbers drawn.
 
-    pictures: tuple[tuple[int, int, np.ndarray], ...]
-    of_pictures: int
-    measured: tuple[int, ...]
-    of_frames: int
-    pulled: tuple[np.ndarray, np.ndarray, float] | None
-    sizes: bool
+    images: (frame, index of its image, background (3,)), frames ascending; image_count: images of the whole step.
+    regularized: frames whose strain and ground terms this part contains; frame_count: frames of the whole step.
+    hull: Gaussians and surface points that are compared with the hull of the last frame, and the weight of the term.
+    scale_term: whether this part contains the term of the mean scale.
+    """
+
+    images: tuple[tuple[int, int, np.ndarray], ...]
+    image_count: int
+    regularized: tuple[int, ...]
+    frame_count: int
+    hull: tuple[np.ndarray, np.ndarray, float] | None
+    scale_term: bool
 
 
 @dataclass(frozen=True)
 class Objective:
-    """The loss of a fit. scale and half_extent [m] make lengths comparable; ``observations`` of each frame that is
-    drawn, and the hulls that pull there."""
+    """The loss of a fit.
+
+    scale, half_extent [m]: lengths that make the terms dimensionless; fps [1/s]. hulls, images: by frame.
+    """
 
     config: ReconstructConfig
     scale: float
     half_extent: float
     fps: float
     ground: Ground | None
-    hulls: Sequence[HullPull] | Mapping[int, HullPull]
-    observations: Sequence[list[ObservedImage]] | Mapping[int, list[ObservedImage]]
+    hulls: Sequence[HullLoss] | Mapping[int, HullLoss]
+    images: Sequence[list[ObservedImage]] | Mapping[int, list[ObservedImage]]
 
     def __call__(
         self,
         gaussians: dict[str, torch.Tensor],
         network: DeformationNetwork,
         pairs: Pairs,
-        pictures: list[tuple[int, int]],
-        pull: float,
+        chosen: list[tuple[int, int]],
+        hull_factor: float,
         rng: np.random.Generator,
     ) -> torch.Tensor:
-        """The loss, a scalar: the sum of its ``parts``."""
-        parts = self.parts(len(gaussians["means"]), pictures, pull, rng)
+        """The loss of one step, a scalar: the sum over ``parts``."""
+        parts = self.parts(len(gaussians["means"]), chosen, hull_factor, rng)
         return torch.stack([self.part(gaussians, network, pairs, part) for part in parts]).sum()
 
     def parts(
-        self, count: int, pictures: list[tuple[int, int]], pull: float, rng: np.random.Generator
+        self, count: int, chosen: list[tuple[int, int]], hull_factor: float, rng: np.random.Generator
     ) -> tuple[Part, ...]:
-        """A step on ``pictures`` (frame, which of its observations), in parts that take about as long as each other:
-        the second has fewer pictures, but hull and sizes. One part where there is one picture.
+        """The loss of one step in two parts of about equal cost, or in one part for a single image.
 
-        count: Gaussians; pull in [0, 1] scales the hulls' weight; rng draws backgrounds and the points that are pulled.
+        The second part has fewer images, but the hull and scale terms. count: Gaussians; chosen: (frame, index of its
+        image); hull_factor in [0, 1] multiplies the weight of the hull; rng draws backgrounds and hull samples.
         """
-        last = max(frame for frame, _ in pictures)
-        weight = self.config.hull_weight * pull
-        pulled = (*self.hulls[last].draw(count, PULLED, rng), weight) if last > 0 and weight > 0 else None
-        drawn = sorted(((*picture, rng.random(3)) for picture in pictures), key=lambda picture: picture[0])
+        last = max(frame for frame, _ in chosen)
+        weight = self.config.hull_weight * hull_factor
+        hull = (*self.hulls[last].draw(count, HULL_SAMPLES, rng), weight) if last > 0 and weight > 0 else None
+        drawn = sorted(((*image, rng.random(3)) for image in chosen), key=lambda image: image[0])
         cut = len(drawn) - len(drawn) // 2
         frames = {frame for frame, *_ in drawn}
         later = {frame for frame, *_ in drawn[cut:]}
 
-        def part(some: list, measured: set[int], last: bool) -> Part:
+        def part(images: list, regularized: set[int], last: bool) -> Part:
             return Part(
-                tuple(some), len(drawn), tuple(sorted(measured)), len(frames), pulled if last else None, sizes=last
+                tuple(images),
+                len(drawn),
+                tuple(sorted(regularized)),
+                len(frames),
+                hull if last else None,
+                scale_term=last,
             )
 
         if cut == len(drawn):
@@ -97,28 +107,28 @@ class Objective:
     ) -> torch.Tensor:
         """The loss of ``part``, a scalar.
 
-        gaussians: means (N, 3) [m], log_scales, opacity_logits (N,), colour_logits (N, 3); pairs: neighbours.
+        gaussians: means (N, 3) [m], log_scales, opacity_logits (N,), colour_logits (N, 3). pairs: neighbours.
         """
         c, means = self.config, gaussians["means"]
         opacities, colours = torch.sigmoid(gaussians["opacity_logits"]), torch.sigmoid(gaussians["colour_logits"])
         loss = means.new_zeros(())
-        if part.sizes:
+        if part.scale_term:
             loss = loss + c.scale_weight * gaussians["log_scales"].exp().mean() / self.scale
-        frames = sorted({frame for frame, *_ in part.pictures})
+        frames = sorted({frame for frame, *_ in part.images})
         displacements, log_changes = torch.zeros(len(frames), len(means), 3), torch.zeros(len(frames), len(means))
         if frames[-1] > 0:
-            # Positions go into the network without a gradient, as in MASIV: the motion answers for the motion.
+            # As in MASIV, the network gets positions without a gradient: errors of the motion change the motion only.
             displacements, log_changes = network.changes(means.detach(), torch.tensor(frames) / self.fps)
-            loss = loss + self._regularisers(means.detach(), displacements, frames, pairs, part)
-        for frame, which, drawn_background in part.pictures:
-            k, view = frames.index(frame), self.observations[frame][which]
+            loss = loss + self._regularization(means.detach(), displacements, frames, pairs, part)
+        for frame, index, drawn_background in part.images:
+            k, observed = frames.index(frame), self.images[frame][index]
             background = torch.tensor(drawn_background, dtype=torch.float32)
             scales = (gaussians["log_scales"] + log_changes[k]).exp()
-            drawn = render(view.camera, means + displacements[k], scales, opacities, colours, background)
-            loss = loss + self._difference(drawn.rgb, drawn.alpha, view, background) / part.of_pictures
+            drawn = render(observed.camera, means + displacements[k], scales, opacities, colours, background)
+            loss = loss + self._image_loss(drawn.rgb, drawn.alpha, observed, background) / part.image_count
         return loss
 
-    def _regularisers(
+    def _regularization(
         self,
         means: torch.Tensor,
         displacements: torch.Tensor,
@@ -126,32 +136,32 @@ class Objective:
         pairs: Pairs,
         part: Part,
     ) -> torch.Tensor:
-        """Strain between neighbours, depth below the ground, distance from the last frame's hull."""
+        """Strain between neighbours, depth below the ground, distance to the hull of the last frame."""
         c = self.config
         total = means.new_zeros(())
-        if part.measured:
-            share = len(part.measured) / part.of_frames
-            here = displacements if len(part.measured) == len(frames) else displacements[
-                [frames.index(frame) for frame in part.measured]
+        if part.regularized:
+            fraction = len(part.regularized) / part.frame_count
+            here = displacements if len(part.regularized) == len(frames) else displacements[
+                [frames.index(frame) for frame in part.regularized]
             ]  # fmt: skip
-            total = total + share * c.rigidity_weight * strain(means, here, *pairs, softening=self.scale)
+            total = total + fraction * c.rigidity_weight * strain(means, here, *pairs, softening=self.scale)
             if self.ground is not None:
                 normal = torch.tensor(self.ground.normal, dtype=torch.float32)
                 below = torch.relu(float(self.ground.height) - (means + here) @ normal)
-                total = total + share * c.ground_weight * below.mean() / self.half_extent
-        if part.pulled is not None:
-            inside, outside, weight = part.pulled
-            far = self.hulls[frames[-1]](means + displacements[-1], inside, outside)
-            total = total + weight * far / self.half_extent
+                total = total + fraction * c.ground_weight * below.mean() / self.half_extent
+        if part.hull is not None:
+            chosen, surface, weight = part.hull
+            distance = self.hulls[frames[-1]](means + displacements[-1], chosen, surface)
+            total = total + weight * distance / self.half_extent
         return total
 
-    def _difference(
-        self, rgb: torch.Tensor, alpha: torch.Tensor, view: ObservedImage, background: torch.Tensor
+    def _image_loss(
+        self, rgb: torch.Tensor, alpha: torch.Tensor, observed: ObservedImage, background: torch.Tensor
     ) -> torch.Tensor:
-        """(1 - l) L1 + l (1 - SSIM) over the background, plus alpha against the mask; what an occluder hides agrees."""
+        """(1 - l) L1 + l (1 - SSIM) over the background, plus L1 of alpha and mask. Occluded pixels have no error."""
         c = self.config
-        target = view.colour + (1 - view.mask)[..., None] * background
-        rgb = torch.lerp(target, rgb, view.valid[..., None])
+        target = observed.colour + (1 - observed.mask)[..., None] * background
+        rgb = torch.lerp(target, rgb, observed.valid[..., None])
         absolute = (rgb - target).abs().mean()
-        silhouette = ((alpha - view.mask) * view.valid).abs().mean()
+        silhouette = ((alpha - observed.mask) * observed.valid).abs().mean()
         return (1 - c.ssim_weight) * absolute + c.ssim_weight * (1 - ssim(rgb, target)) + c.alpha_weight * silhouette

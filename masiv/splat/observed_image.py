@@ -1,21 +1,27 @@
-"""Pictures as the fit sees them: the object's box, averaged down to a manageable size, background removed."""
+"""Images as the fit uses them: cropped to the object, averaged down, without their background."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
+from masiv.errors import MasivError
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
+from masiv.splat.config import ReconstructConfig
 
 
 @dataclass(frozen=True)
 class ObservedImage:
-    """One picture of the object. camera of the crop; colour (H, W, 3) in [0, 1], zero off the object (premultiplied by
-    the mask); mask (H, W) in [0, 1]; valid (H, W), share of a pixel that no occluder hides. float32 tensors."""
+    """One image of the object; float32 tensors.
+
+    camera: of the crop. colour (H, W, 3) in [0, 1], multiplied by the mask. mask (H, W) in [0, 1]. valid (H, W): the
+    fraction of a pixel that no occluder hides.
+    """
 
     camera: Camera
     colour: torch.Tensor
@@ -23,11 +29,26 @@ class ObservedImage:
     valid: torch.Tensor
 
 
-def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_padding: int) -> ObservedImage | None:
-    """The object in ``view`` at ``frame``, or None where its mask is empty.
+def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[list[ObservedImage]]:
+    """The images of each of ``frames`` that show the object. Raises MasivError for a frame without any."""
+    found = []
+    for frame in frames:
+        of_frame = [
+            observed_image(scene, view, frame, crop_side=config.crop_side, crop_padding=config.crop_padding)
+            for view in scene.views
+        ]
+        found.append([image for image in of_frame if image is not None])
+        if not found[-1]:
+            raise MasivError(f"frame {frame} of {scene.path}: no view shows the object; check its masks")
+    return found
 
-    The box of the mask gets a margin of ``crop_padding`` (averaged) pixels, ends at the image's border, and is averaged
-    over blocks of f x f pixels, f the smallest integer that makes the box at most ``crop_side`` wide and high.
+
+def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_padding: int) -> ObservedImage | None:
+    """The object in ``view`` at ``frame``, or None if its mask is empty.
+
+    The crop is the bounding box of the mask plus ``crop_padding`` (averaged) pixels, inside of the image. It is
+    averaged over blocks of f x f pixels; f is the smallest integer for which the box has at most ``crop_side`` pixels
+    a side.
     """
     picture, camera = scene.frame(view, frame), scene.cameras[view]
     rows, columns = np.nonzero(picture.mask > 0.5)
@@ -41,18 +62,18 @@ def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_
     valid = picture.valid[window].astype(np.float32)
     mask = picture.mask[window] * valid
     colour = picture.image[window].astype(np.float32) / 255 * mask[..., None]
-    share = _averaged(valid, factor)
-    seen = np.maximum(share, 1e-6)
+    visible = _average(valid, factor)
+    divisor = np.maximum(visible, 1e-6)
     return ObservedImage(
-        _shrunk(camera.cropped(x0, y0, width * factor, height * factor), factor),
-        torch.from_numpy(_averaged(colour, factor) / seen[..., None]),
-        torch.from_numpy(_averaged(mask, factor) / seen),
-        torch.from_numpy(share),
+        _reduced_camera(camera.cropped(x0, y0, width * factor, height * factor), factor),
+        torch.from_numpy(_average(colour, factor) / divisor[..., None]),
+        torch.from_numpy(_average(mask, factor) / divisor),
+        torch.from_numpy(visible),
     )
 
 
 def _span(indices: np.ndarray, padding: int, factor: int, limit: int) -> tuple[int, int]:
-    """First pixel and number of blocks along one axis, inside of [0, limit)."""
+    """First pixel and number of blocks along one axis, inside [0, limit)."""
     start = max(0, int(indices.min()) - padding * factor)
     stop = min(limit, int(indices.max()) + 1 + padding * factor)
     blocks = math.ceil((stop - start) / factor)
@@ -62,15 +83,15 @@ def _span(indices: np.ndarray, padding: int, factor: int, limit: int) -> tuple[i
     return start, blocks
 
 
-def _averaged(image: np.ndarray, factor: int) -> np.ndarray:
+def _average(image: np.ndarray, factor: int) -> np.ndarray:
     if factor == 1:
         return np.ascontiguousarray(image)
     height, width = image.shape[0] // factor, image.shape[1] // factor
     return image.reshape(height, factor, width, factor, *image.shape[2:]).mean(axis=(1, 3))
 
 
-def _shrunk(camera: Camera, factor: int) -> Camera:
-    """The camera of a picture averaged over factor x factor blocks (pixel centres at +0.5, so all of K scales)."""
+def _reduced_camera(camera: Camera, factor: int) -> Camera:
+    """The camera of an image averaged over factor x factor blocks. All of K scales, since pixel centres are at +0.5."""
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2] /= factor
     return replace(camera, width=camera.width // factor, height=camera.height // factor, intrinsics=intrinsics)

@@ -79,7 +79,7 @@ def _effects(spec: SynthSpec, rest, volume: float) -> ActiveEffects:
 
     from masiv.effects.active import ActiveEffects
     from masiv.effects.catalogue import effect_named
-    from masiv.effects.effect import EffectContext
+    from masiv.effects.context import EffectContext
 
     members = []
     for name, given in spec.effects.items():

@@ -13,7 +13,8 @@ from masiv.tracks.placement import Placement
 from masiv.tracks.tracks import Clamp
 
 if TYPE_CHECKING:
-    from masiv.effects.effect import DragBody, EffectParameter
+    from masiv.effects.context import EffectParameter
+    from masiv.effects.per_body import DragBody
     from masiv.materials.law import Law
 
 
@@ -107,8 +108,8 @@ class TwinEffect:
         """Whether ``values`` are those that bodies of different size and mass can share."""
         from masiv.effects.catalogue import effect_named
 
-        shared = effect_named(self.name).shared
-        return shared is not None and set(self.values) == {p.name for p in shared}
+        per_body = effect_named(self.name).per_body
+        return per_body is not None and set(self.values) == {p.name for p in per_body.parameters}
 
     @property
     def parameters(self) -> tuple[EffectParameter, ...]:
@@ -116,7 +117,7 @@ class TwinEffect:
         from masiv.effects.catalogue import effect_named
 
         effect = effect_named(self.name)
-        return effect.shared if self.shared and effect.shared else effect.parameters
+        return effect.per_body.parameters if self.shared and effect.per_body else effect.parameters
 
     def rows(self) -> list[tuple[str, float, str, float | None]]:
         """(parameter, value, unit, standard error) in the order of the library. Raises InputError."""

@@ -310,7 +310,7 @@ def read_document(
 
 
 def _body(part: BodyPart, where: str, folder: Path) -> Body:
-    from masiv.effects.effect import DragBody
+    from masiv.effects.per_body import DragBody
     from masiv.materials.load import load_law
 
     law = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from masiv.effects.effect import DragBody
+from masiv.effects.per_body import DragBody
 from masiv.errors import InputError
 from masiv.mpm.config import SimulatorConfig
 from masiv.tracks.config import TracksConfig

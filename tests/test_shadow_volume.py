@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.fill import fill_volume
 from masiv.hull.carve import visual_hull
-from masiv.hull.settle import VOLUME_SLACK, settled, settled_hull
+from masiv.hull.shadow_volume import MAX_VOLUME_RATIO, keep_lowest_voxels, remove_shadow_volume
 from masiv.hull.silhouette import Silhouette, silhouettes
 
 RADIUS, THICKNESS = 0.45, 0.08
@@ -48,8 +48,8 @@ def hulls(scene):
 def test_a_puddle_loses_the_cone_above_it(scene, hulls):
     ball, disc = hulls
     assert disc.volume > 1.4 * ball.volume
-    flat = settled_hull(scene, 1, disc, ball.volume)
-    assert flat.volume == pytest.approx(VOLUME_SLACK * ball.volume, abs=2 * disc.spacing**3)
+    flat = remove_shadow_volume(scene, 1, disc, ball.volume)
+    assert flat.volume == pytest.approx(MAX_VOLUME_RATIO * ball.volume, abs=2 * disc.spacing**3)
     high = THICKNESS + 1.5 * disc.spacing
     assert (disc.points[:, 1] > high).mean() > 0.2
     assert (flat.points[:, 1] > high).mean() < 0.02
@@ -61,7 +61,7 @@ def test_a_puddle_loses_the_cone_above_it(scene, hulls):
 
 def test_no_silhouette_is_uncovered(scene, hulls):
     disc = hulls[1]
-    kept = disc.points[settled(disc.points, disc.spacing, silhouettes(scene, 1), scene.up, 0.0)]
+    kept = disc.points[keep_lowest_voxels(disc.points, disc.spacing, silhouettes(scene, 1), scene.up, 0.0)]
     assert len(kept) < 0.6 * len(disc.points)
     for camera in CAMERAS:
         before, depth = camera.project(disc.points)
@@ -71,10 +71,10 @@ def test_no_silhouette_is_uncovered(scene, hulls):
 
 def test_what_has_not_grown_flies_or_has_no_ground_is_left_alone(scene, hulls):
     ball, disc = hulls
-    assert settled_hull(scene, 1, disc, disc.volume / VOLUME_SLACK) is disc
-    assert settled_hull(scene, 0, ball, 0.5 * ball.volume) is ball
+    assert remove_shadow_volume(scene, 1, disc, disc.volume / MAX_VOLUME_RATIO) is disc
+    assert remove_shadow_volume(scene, 0, ball, 0.5 * ball.volume) is ball
     for other in ({"ground": None}, {"gravity": np.zeros(3)}):
-        assert settled_hull(dataclasses.replace(scene, **other), 1, disc, ball.volume) is disc
+        assert remove_shadow_volume(dataclasses.replace(scene, **other), 1, disc, ball.volume) is disc
 
 
 def test_an_arch_stands_where_the_silhouette_needs_it():
@@ -84,11 +84,11 @@ def test_an_arch_stands_where_the_silhouette_needs_it():
     points = size * np.array([(i + 0.5, j + 0.5, k - 0.5) for k in (0, 1) for i, j in flat])
     camera = look_at("front", np.array([0.0, 0.0, far]), np.zeros(3), 96, 2 * far / size)
     view = Silhouette(0, camera, np.full((96, 96), -1.0, np.float32), np.ones((96, 96), bool))
-    stays = settled(points, size, (view,), np.array([0.0, 1.0, 0.0]), 0.0)
+    stays = keep_lowest_voxels(points, size, (view,), np.array([0.0, 1.0, 0.0]), 0.0)
     assert stays.sum() == len(flat)
     np.testing.assert_array_equal(np.unique(points[stays][:, :2], axis=0), np.unique(points[:, :2], axis=0))
     # The highest go first.
-    half = settled(points, size, (view,), np.array([0.0, 1.0, 0.0]), (len(points) - 10) * size**3)
+    half = keep_lowest_voxels(points, size, (view,), np.array([0.0, 1.0, 0.0]), (len(points) - 10) * size**3)
     assert (~half).sum() == 10
     assert (points[~half, 1] > 11 * size).all()
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from masiv.hull.carve import VisualHull
-from masiv.splat.pull import HullPull
+from masiv.splat.hull_loss import HullLoss
 
 SPACING = 0.01
 
@@ -19,7 +19,7 @@ def slab(height):
 
 
 def pulled(hull, means):
-    pull = HullPull(hull)
+    pull = HullLoss(hull)
     far = pull(means, *pull.draw(len(means), 10**6, np.random.default_rng(0)))
     (gradient,) = torch.autograd.grad(far, [means])
     return float(far.detach()), float(gradient[:, 1].sum())

@@ -1,4 +1,4 @@
-"""The particles of a finished trajectory, followed through frames that its fit has not seen."""
+"""Continue a finished trajectory through frames that it was not fitted to."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import torch
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.fill import FilledVolume, fill_volume
-from masiv.continuum.finetune import Known, fine_tune
-from masiv.continuum.trajectory import Trajectory, carry
+from masiv.continuum.finetune import KnownMotion, fine_tune
+from masiv.continuum.trajectory import Trajectory, positions_at
 from masiv.errors import InputError, MasivError
 from masiv.hull.carve import visual_hull
 from masiv.progress import Progress, silent
@@ -20,13 +20,13 @@ from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 
-_STEPS, _POINTS, _RATE = 300, 400, 3e-3
-"""Of the cheap fit, without volumes, that begins the fine-tuning where the trajectory ended."""
+_STEPS, _POINTS, _LEARNING_RATE = 300, 400, 3e-3
+"""Of the fit that initializes the network before fine-tuning."""
 
 
 def extend_trajectory(
     scene: Scene,
-    dynamic_all: DynamicGaussians,
+    dynamic: DynamicGaussians,
     trajectory: Trajectory,
     config: TrajectoryConfig,
     *,
@@ -34,17 +34,18 @@ def extend_trajectory(
     checkpoint: Checkpoint | None = None,
     progress: Progress = silent,
 ) -> Trajectory:
-    """``trajectory``, of the first N frames of ``scene``, through all of them; ``dynamic_all`` knows all their motion.
+    """``trajectory``, of the first N frames of ``scene``, extended to all frames.
 
-    positions[:N] are those given; its network has them nearly (they pull on it), so ``evaluate`` is meant for times
-    from frame N on. Raises InputError where ``scene`` has no further frame, MasivError where a new one leaves nothing
-    to fill or the motion becomes non-finite.
+    dynamic: Gaussians with a motion over all frames, as ``extend_frames`` gives it. positions[:N] of the result equal
+    those given. Its network only approximates them, so use ``evaluate`` for times from frame N on.
+    Raises InputError if ``scene`` has no further frame, MasivError if a new frame has no volume to fill or the motion
+    becomes non-finite.
     """
     known = len(trajectory.positions)
-    motion = dynamic_all.deformation
+    motion = dynamic.deformation
     if not known < scene.frame_count == motion.frame_count:
         raise InputError(
-            f"{scene.path} has {scene.frame_count} frames, the followed motion {motion.frame_count} and the trajectory "
+            f"{scene.path} has {scene.frame_count} frames, the extended motion {motion.frame_count} and the trajectory "
             f"{known}: give the scene and the motion of the same frames, more than the trajectory has"
         )
     start = FilledVolume(trajectory.positions[0].astype(np.float64), trajectory.spacing, trajectory.volume)
@@ -52,34 +53,36 @@ def extend_trajectory(
     volumes = []
     for frame in range(known, scene.frame_count):
         progress("fill new frames", frame - known + 1, scene.frame_count - known)
-        volumes.append(fill_volume(scene, dynamic_all, frame, config, spacing=0.9 * start.spacing, volume=hull))
-    first = Known(
+        volumes.append(fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=hull))
+    known_motion = KnownMotion(
         torch.from_numpy(trajectory.positions - trajectory.positions[0]),
-        _joined(motion, dynamic_all.canonical.means.detach(), trajectory, seed),
+        _initial_network(motion, dynamic.canonical.means.detach(), trajectory, seed),
     )
     network = fine_tune(
         scene,
-        dynamic_all,
+        dynamic,
         start,
         volumes,
         config,
         seed=seed,
         checkpoint=checkpoint or Checkpoint(None),
         progress=progress,
-        known=first,
+        known=known_motion,
     )
-    new = carry(network, trajectory.positions[0], scene.times[known:])
+    new = positions_at(network, trajectory.positions[0], scene.times[known:])
     if not np.isfinite(new).all():
         raise MasivError("the motion of the new frames became non-finite; lower trajectory.learning_rate")
     positions = np.concatenate([trajectory.positions, new])
     return Trajectory(positions, scene.times, trajectory.spacing, trajectory.volume, network)
 
 
-def _joined(motion: DeformationNetwork, surface: torch.Tensor, trajectory: Trajectory, seed: int) -> DeformationNetwork:
-    """A copy of ``motion`` that has the trajectory's known frames, and goes on from its last one as ``motion`` does.
+def _initial_network(
+    motion: DeformationNetwork, surface: torch.Tensor, trajectory: Trajectory, seed: int
+) -> DeformationNetwork:
+    """A copy of ``motion``, fitted to the known frames of ``trajectory`` and to ``motion`` after them.
 
-    Where fine-tuning has moved a particle off the pictures' motion by then, it stays as far off: without that the
-    particles would jump between the last known frame and the first new one. surface: Gaussians (N, 3) [m] at frame 0.
+    surface: Gaussians (N, 3) [m] at frame 0. The offset between trajectory and ``motion`` at the last known frame is
+    added to all later frames. Without it the particles would jump between the last known and the first new frame.
     """
     known = len(trajectory.positions)
     points = torch.cat([torch.from_numpy(trajectory.positions[0]), surface.float()])
@@ -96,7 +99,7 @@ def _joined(motion: DeformationNetwork, surface: torch.Tensor, trajectory: Traje
         rng = np.random.default_rng((seed, 1, step))
         chosen = torch.from_numpy(rng.permutation(len(points))[:_POINTS])
         for group in optimiser.param_groups:
-            group["lr"] = _RATE * (0.01 + 0.495 * (1 + math.cos(math.pi * step / _STEPS)))
+            group["lr"] = _LEARNING_RATE * (0.01 + 0.495 * (1 + math.cos(math.pi * step / _STEPS)))
         optimiser.zero_grad()
         off = network.displacements(points[chosen], times) - target[:, chosen]
         (off.square().sum(-1).mean() / extent**2).backward()

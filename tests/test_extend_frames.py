@@ -1,4 +1,4 @@
-"""A textured ball whose later frames a finished reconstruction has not seen: they are followed, the rest stays."""
+"""A textured ball whose later frames a finished reconstruction has not seen: they are extended, the rest stays."""
 
 import dataclasses
 from pathlib import Path
@@ -11,8 +11,8 @@ from test_reconstruct import FPS, SIDE, ball, camera_at
 from masiv.checkpoint import Checkpoint
 from masiv.config import Config
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.extend import extend_trajectory
-from masiv.continuum.trajectory import Trajectory, carry
+from masiv.continuum.extend_trajectory import extend_trajectory
+from masiv.continuum.trajectory import Trajectory, positions_at
 from masiv.errors import InputError
 from masiv.pipeline import stages
 from masiv.runfolder import Request, RunFolder
@@ -21,8 +21,7 @@ from masiv.splat._reference import _render
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
-from masiv.splat.follow import follow
-from masiv.splat.follow_config import FollowConfig
+from masiv.splat.extend_frames import ExtendFramesConfig, extend_frames
 from masiv.splat.gaussians import Gaussians
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -32,8 +31,8 @@ CONFIG = ReconstructConfig(
     gaussians=250, hull_resolution=20, crop_side=40, crop_padding=4, width=16, depth=1, space_octaves=1, iterations=120,
     processes=1,
 )  # fmt: skip
-FOLLOW = FollowConfig(effort=1.0, relearn_steps=150)
-TRAJECTORY = TrajectoryConfig(fill_resolution=28, iterations=60, batch=300)
+EXTENSION = ExtendFramesConfig(step_ratio=1.0, pretrain_steps=150)
+TRAJECTORY = TrajectoryConfig(fill_resolution=28, iterations=60, batch_size=300)
 
 
 def truth(offset, frame):
@@ -91,8 +90,8 @@ def fitted():
 
 
 @pytest.fixture(scope="module")
-def followed(scene, fitted):
-    return follow(scene, fitted, CONFIG, FOLLOW, seed=2)
+def extended(scene, fitted):
+    return extend_frames(scene, fitted, CONFIG, EXTENSION, seed=2)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +102,7 @@ def particles(fitted):
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     offset = grid[np.linalg.norm(grid, axis=1) < 0.19]
     times = np.arange(KNOWN) / FPS
-    positions = carry(fitted.deformation, CENTRE + offset, times)
+    positions = positions_at(fitted.deformation, CENTRE + offset, times)
     return Trajectory(positions, times, spacing, len(offset) * spacing**3, fitted.deformation)
 
 
@@ -114,21 +113,21 @@ def mean_error(moved, offset, frame):
     return error, np.linalg.norm(expected - expected.mean(axis=0), axis=1).mean()
 
 
-def test_new_frames_are_followed_and_known_ones_stay(followed, fitted):
+def test_new_frames_are_followed_and_known_ones_stay(extended, fitted):
     offset, _ = surface()
     for name in ("means", "scales", "opacities", "colours"):
-        assert torch.equal(getattr(followed.canonical, name), getattr(fitted.canonical, name))
-    assert followed.deformation.frame_count == FRAMES
+        assert torch.equal(getattr(extended.canonical, name), getattr(fitted.canonical, name))
+    assert extended.deformation.frame_count == FRAMES
     for frame in range(FRAMES):
         with torch.no_grad():
-            moved = followed.deformation(fitted.canonical.means, frame / FPS)[0].numpy()
+            moved = extended.deformation(fitted.canonical.means, frame / FPS)[0].numpy()
         error, rigid = mean_error(moved, offset, frame)
         assert error < (0.002 if frame < KNOWN else 0.012), frame
         # Better than moving the whole ball: the flattening is seen too.
         assert frame < FRAMES - 1 or error < 0.5 * rigid
 
 
-def test_resumed_pass_ends_with_the_same_numbers(scene, fitted, followed, tmp_path):
+def test_resumed_pass_ends_with_the_same_numbers(scene, fitted, extended, tmp_path):
     checkpoint = Checkpoint(tmp_path / "state.pt", every_s=0.0)
 
     def interrupt(stage, done, total, note=""):
@@ -136,15 +135,15 @@ def test_resumed_pass_ends_with_the_same_numbers(scene, fitted, followed, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        follow(scene, fitted, CONFIG, FOLLOW, seed=2, checkpoint=checkpoint, progress=interrupt)
+        extend_frames(scene, fitted, CONFIG, EXTENSION, seed=2, checkpoint=checkpoint, progress=interrupt)
     assert checkpoint.load()["iteration"] == 50
-    again = follow(scene, fitted, CONFIG, FOLLOW, seed=2, checkpoint=checkpoint)
-    for name, value in followed.deformation.state_dict().items():
+    again = extend_frames(scene, fitted, CONFIG, EXTENSION, seed=2, checkpoint=checkpoint)
+    for name, value in extended.deformation.state_dict().items():
         assert torch.equal(value, again.deformation.state_dict()[name]), name
 
 
-def test_the_same_particles_go_on(scene, followed, particles):
-    result = extend_trajectory(scene, followed, particles, TRAJECTORY, seed=1)
+def test_the_same_particles_go_on(scene, extended, particles):
+    result = extend_trajectory(scene, extended, particles, TRAJECTORY, seed=1)
     assert result.positions.shape == (FRAMES, *particles.positions.shape[1:])
     np.testing.assert_array_equal(result.positions[:KNOWN], particles.positions)
     again = result.evaluate(result.times)
@@ -156,9 +155,9 @@ def test_the_same_particles_go_on(scene, followed, particles):
         assert error < 0.25 * particles.spacing, frame
 
 
-def test_without_a_further_frame_there_is_nothing_to_follow(scene, fitted, followed, particles):
+def test_without_a_further_frame_there_is_nothing_to_follow(scene, fitted, extended, particles):
     with pytest.raises(InputError, match="beyond those that were fitted"):
-        follow(scene.restricted(KNOWN), fitted, CONFIG, FOLLOW, seed=0)
+        extend_frames(scene.restricted(KNOWN), fitted, CONFIG, EXTENSION, seed=0)
     with pytest.raises(InputError, match="more than the trajectory has"):
         extend_trajectory(scene, fitted, particles, TRAJECTORY)
 

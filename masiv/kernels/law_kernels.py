@@ -3,7 +3,8 @@
 import taichi as ti
 
 from masiv import runtime
-from masiv.kernels import tensor
+from masiv.kernels import isotropic
+from masiv.kernels.laws import law_function
 
 
 @ti.data_oriented
@@ -17,7 +18,7 @@ class ClassicalKernels:
     def __init__(self, mpm, kind: str, coefficients: int):
         self.mpm = mpm
         self.owner = None  # the rollout whose coefficients the field holds
-        self.law = tensor.CLASSICAL[kind]
+        self.law = law_function(kind)
         self.n_coefficients = coefficients
         capacity, real = mpm.capacity_particles, mpm.real
         self.trial = ti.Matrix.field(3, 3, real, shape=capacity, needs_grad=True)
@@ -85,7 +86,7 @@ class ClassicalKernels:
 class InvariantKernels:
     """A law whose coefficients are functions of the strain invariants, evaluated in torch between two kernels.
 
-    share (N, 2) are the coefficients of ``tensor.neural_flow``, moduli (N, 4) those of ``tensor.neural_stress``. The
+    share (N, 2) are the coefficients of ``isotropic.flow``, moduli (N, 4) those of ``isotropic.stress``. The
     adjoints are by hand: Taichi's autodiff takes minutes to compile the inverses.
     """
 
@@ -95,14 +96,14 @@ class InvariantKernels:
     @ti.kernel
     def trial_invariants(self, s: ti.i32, out: ti.types.ndarray()):
         for p in range(out.shape[0]):
-            value = tensor.invariants(tensor.isochoric_strain(self.mpm.trial_gradient[s, p]))
+            value = isotropic.invariants(isotropic.isochoric_strain(self.mpm.trial_gradient[s, p]))
             for a in ti.static(range(3)):
                 out[p, a] = value[a]
 
     @ti.kernel
     def final_invariants(self, s: ti.i32, out: ti.types.ndarray()):
         for p in range(out.shape[0]):
-            value = tensor.invariants(tensor.isochoric_strain(self.mpm.deformation_gradient[s, p]))
+            value = isotropic.invariants(isotropic.isochoric_strain(self.mpm.deformation_gradient[s, p]))
             for a in ti.static(range(3)):
                 out[p, a] = value[a]
 
@@ -111,9 +112,9 @@ class InvariantKernels:
         """Apply the flow, and give the invariants (N, 3) of what is left."""
         for p in range(out.shape[0]):
             trial, c = self.mpm.trial_gradient[s, p], ti.Vector([share[p, 0], share[p, 1]])
-            f = tensor.neural_flow(trial, tensor.isochoric_strain(trial), c)
+            f = isotropic.flow(trial, isotropic.isochoric_strain(trial), c)
             self.mpm.deformation_gradient[s, p] = f
-            value = tensor.invariants(tensor.isochoric_strain(f))
+            value = isotropic.invariants(isotropic.isochoric_strain(f))
             for a in ti.static(range(3)):
                 out[p, a] = value[a]
 
@@ -121,8 +122,8 @@ class InvariantKernels:
     def elastic(self, s: ti.i32, moduli: ti.types.ndarray()):
         for p in range(moduli.shape[0]):
             c = ti.Vector([moduli[p, 0], moduli[p, 1], moduli[p, 2], moduli[p, 3]])
-            strain = tensor.isochoric_strain(self.mpm.deformation_gradient[s, p])
-            self.mpm.kirchhoff_stress[s, p] = tensor.neural_stress(strain, c)
+            strain = isotropic.isochoric_strain(self.mpm.deformation_gradient[s, p])
+            self.mpm.kirchhoff_stress[s, p] = isotropic.stress(strain, c)
 
     @ti.kernel
     def elastic_adjoint(self, s: ti.i32, moduli: ti.types.ndarray(), moduli_bar: ti.types.ndarray()):
@@ -130,9 +131,9 @@ class InvariantKernels:
         for p in range(moduli.shape[0]):
             c = ti.Vector([moduli[p, 0], moduli[p, 1], moduli[p, 2], moduli[p, 3]])
             f = self.mpm.deformation_gradient[s, p]
-            strain = tensor.isochoric_strain(f)
-            c_bar, log_j_bar, b_bar, b_inverse_bar = tensor.neural_stress_adjoint(strain, c, self.mpm.stress_bar[p])
-            self.mpm.gradient_bar[p] += tensor.strain_adjoint(f, strain, log_j_bar, b_bar, b_inverse_bar)
+            strain = isotropic.isochoric_strain(f)
+            c_bar, log_j_bar, b_bar, b_inverse_bar = isotropic.stress_adjoint(strain, c, self.mpm.stress_bar[p])
+            self.mpm.gradient_bar[p] += isotropic.strain_adjoint(f, strain, log_j_bar, b_bar, b_inverse_bar)
             for a in ti.static(range(4)):
                 moduli_bar[p, a] = c_bar[a]
 
@@ -144,10 +145,10 @@ class InvariantKernels:
         for p in range(share.shape[0]):
             trial, out = self.mpm.trial_gradient[s, p], self.mpm.deformation_gradient[s, p]
             bar = ti.Vector([final_bar[p, 0], final_bar[p, 1], final_bar[p, 2]])
-            out_bar = self.mpm.gradient_bar[p] + tensor.invariants_adjoint(out, bar)
-            c, strain = ti.Vector([share[p, 0], share[p, 1]]), tensor.isochoric_strain(trial)
-            c_bar, f_bar, log_j_bar, b_bar, b_inverse_bar = tensor.neural_flow_adjoint(trial, strain, c, out, out_bar)
-            self.mpm.trial_bar[p] = f_bar + tensor.strain_adjoint(trial, strain, log_j_bar, b_bar, b_inverse_bar)
+            out_bar = self.mpm.gradient_bar[p] + isotropic.invariants_adjoint(out, bar)
+            c, strain = ti.Vector([share[p, 0], share[p, 1]]), isotropic.isochoric_strain(trial)
+            c_bar, f_bar, log_j_bar, b_bar, b_inverse_bar = isotropic.flow_adjoint(trial, strain, c, out, out_bar)
+            self.mpm.trial_bar[p] = f_bar + isotropic.strain_adjoint(trial, strain, log_j_bar, b_bar, b_inverse_bar)
             for a in ti.static(range(2)):
                 share_bar[p, a] = c_bar[a]
 
@@ -156,4 +157,4 @@ class InvariantKernels:
         """The adjoint (N, 3) of the trial invariants -> added to ``trial_bar``."""
         for p in range(bar.shape[0]):
             value = ti.Vector([bar[p, 0], bar[p, 1], bar[p, 2]])
-            self.mpm.trial_bar[p] += tensor.invariants_adjoint(self.mpm.trial_gradient[s, p], value)
+            self.mpm.trial_bar[p] += isotropic.invariants_adjoint(self.mpm.trial_gradient[s, p], value)

@@ -1,4 +1,4 @@
-"""Where the fit starts: Gaussians on the first frame's hull, and how each frame's hull has moved."""
+"""Initial state of the fit: Gaussians on the surface of the first frame's hull, and the motion of the hulls."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ import numpy as np
 
 from masiv.errors import MasivError
 from masiv.hull.carve import VisualHull, visual_hull
-from masiv.hull.settle import settled_hull
+from masiv.hull.shadow_volume import remove_shadow_volume
 from masiv.scene.scene import Scene
 
 
 @dataclass(frozen=True)
-class Start:
-    """means (N, 3) [m]; scale [m]; colours (N, 3) in [0, 1]; centre (3,) and half_extent [m] of the first hull;
-    base_motion (T, 3) [m], centroids of the hulls relative to frame 0; hulls of the T frames, settled."""
+class InitialGaussians:
+    """means (N, 3) [m]; scale [m]: standard deviation of all; colours (N, 3) in [0, 1].
+
+    centre (3,) and half_extent [m]: of the first hull. base_motion (T, 3) [m]: centroids of the hulls relative to frame
+    0. hulls: of the T frames, without shadow volume.
+    """
 
     means: np.ndarray
     scale: float
@@ -26,20 +29,25 @@ class Start:
     hulls: tuple[VisualHull, ...]
 
 
-def starting_point(scene: Scene, count: int, resolution: int, rng: np.random.Generator) -> Start:
-    """Start from the visual hulls of ``scene``. Raises MasivError where a hull is empty, as ``visual_hull`` does."""
+def initial_gaussians(scene: Scene, count: int, resolution: int, rng: np.random.Generator) -> InitialGaussians:
+    """At most ``count`` Gaussians on the first visual hull, which has ``resolution`` voxels along its longest side.
+
+    Raises MasivError if a hull is empty or the first one is a single voxel.
+    """
     hull = visual_hull(scene, 0, resolution=resolution)
     later = (visual_hull(scene, frame, resolution=resolution) for frame in range(1, scene.frame_count))
-    hulls = (hull, *(settled_hull(scene, frame, h, hull.volume) for frame, h in enumerate(later, start=1)))
+    hulls = (hull, *(remove_shadow_volume(scene, frame, h, hull.volume) for frame, h in enumerate(later, start=1)))
     centroids = np.stack([h.points.mean(axis=0) for h in hulls])
     shell = hull.points[hull.surface]
     if len(shell) < 2:
-        raise MasivError(f"the visual hull of frame 0 of {scene.path} is a single voxel: raise hull_resolution")
+        raise MasivError(
+            f"the visual hull of frame 0 of {scene.path} is a single voxel: raise reconstruct.hull_resolution"
+        )
     area = len(shell) * hull.spacing**2
     chosen = np.sort(rng.permutation(len(shell))[: min(count, len(shell))])
     means = shell[chosen] + rng.uniform(-0.25, 0.25, (len(chosen), 3)) * hull.spacing
     low, high = hull.points.min(axis=0), hull.points.max(axis=0)
-    return Start(
+    return InitialGaussians(
         means=means,
         scale=0.6 * float(np.sqrt(area / len(means))),
         colours=_colours(scene, hull, means),
@@ -51,9 +59,9 @@ def starting_point(scene: Scene, count: int, resolution: int, rng: np.random.Gen
 
 
 def _colours(scene: Scene, hull: VisualHull, means: np.ndarray) -> np.ndarray:
-    """Mean colour (N, 3) of each point over the views of frame 0 where it is in front; grey where no view has it.
+    """Mean colour (N, 3) of each point over the views of frame 0 that show it; grey if no view does.
 
-    A point is in front where it is no deeper than two voxels behind the nearest point of the hull in its pixel.
+    A view shows a point if it is at most two voxels behind the nearest point of the hull in its pixel.
     """
     total, weight = np.zeros((len(means), 3)), np.zeros(len(means))
     shell = hull.points[hull.surface]
@@ -70,9 +78,9 @@ def _colours(scene: Scene, hull: VisualHull, means: np.ndarray) -> np.ndarray:
         index = np.flatnonzero(inside)
         row, column = row[index], column[index]
         in_front = depth[index] <= nearest[row + 1, column + 1] + 2 * hull.spacing
-        share = picture.mask[row, column] * picture.valid[row, column] * in_front
-        total[index] += share[:, None] * picture.image[row, column] / 255
-        weight[index] += share
+        shown = picture.mask[row, column] * picture.valid[row, column] * in_front
+        total[index] += shown[:, None] * picture.image[row, column] / 255
+        weight[index] += shown
     return np.where(weight[:, None] > 0, total / np.maximum(weight, 1e-9)[:, None], 0.5)
 
 

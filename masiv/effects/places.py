@@ -1,48 +1,49 @@
-"""Places: their parameters, a bump around one, and a few that cover a cloud of points."""
+"""Places in a body: their parameters, weights around one, and a few that cover a cloud of points."""
 
 from __future__ import annotations
 
 import torch
 
-from masiv.effects.effect import EffectParameter
+from masiv.effects.context import EffectParameter
 
 NEWTON_STEPS = 8
-FLAT = 0.02
-"""Variance, over radius^2, below which a distribution counts as flat against a surface."""
-BEYOND = 4.0
+MIN_VARIANCE = 0.02
+"""Added to the variances, over radius^2: keeps Newton's step finite if the weights are flat against a surface."""
+MAX_DISTANCE = 4.0
+"""Largest distance, in radii, of the Gaussian's centre from its mean."""
 PLACE = tuple(EffectParameter(axis, "m", -100.0, 100.0, 0.02) for axis in "xyz")
 
 
 def square_distance(points: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """(N,) [m^2] of points (N, 3) from a place (3,)."""
+    """Square distances (N,) [m^2] of points (N, 3) from a place (3,)."""
     return (points - place).square().sum(1)
 
 
-def shares(points: torch.Tensor, place: torch.Tensor, radius: float) -> torch.Tensor:
-    """(N,) that sum up to 1, of something that is spread as exp(-|X - c|^2 / (2 radius^2)) over the points (N, 3).
+def weights_around(points: torch.Tensor, place: torch.Tensor, radius: float) -> torch.Tensor:
+    r"""Weights (N,), $w_p \propto e^{-|x_p - c|^2 / (2 r^2)}$ with sum 1 and mean ``place``; differentiable.
 
-    c is such that its mean is the ``place`` (3,) (Newton's method on the dual of the distribution of greatest entropy
-    with that mean), but no farther from it than BEYOND: at the face of a body it is in the outermost points, and over
-    the radius along them. Differentiable.
+    points (N, 3) [m]; place (3,) [m]; radius r [m]. The centre c is solved for by Newton's method on the dual of the
+    maximum-entropy problem with that mean. It stays within ``MAX_DISTANCE`` radii of the place: for a place at the face
+    of a body the weights lie in its outermost points.
     """
     points, place = points.double(), place.double()
     tilt, eye = torch.zeros_like(place), torch.eye(3, dtype=points.dtype)
 
-    def share() -> torch.Tensor:
-        centre = place + tilt / torch.sqrt(1 + (tilt / (BEYOND * radius)).square().sum())
+    def weights() -> torch.Tensor:
+        centre = place + tilt / torch.sqrt(1 + (tilt / (MAX_DISTANCE * radius)).square().sum())
         return torch.softmax(-0.5 * square_distance(points, centre) / radius**2, 0)
 
     for _ in range(NEWTON_STEPS):
-        now = share()
+        now = weights()
         mean = (now[:, None] * points).sum(0)
         off = points - mean
         wide = (now[:, None, None] * off[:, :, None] * off[:, None, :]).sum(0) / radius**2
-        tilt = tilt + torch.linalg.solve(wide + FLAT * eye, place - mean)
-    return share()
+        tilt = tilt + torch.linalg.solve(wide + MIN_VARIANCE * eye, place - mean)
+    return weights()
 
 
-def faces(points: torch.Tensor) -> torch.Tensor:
-    """Middles (6, 3) of the outermost points (N, 3) along each axis, either way."""
+def face_centres(points: torch.Tensor) -> torch.Tensor:
+    """Means (6, 3) of the outermost points of (N, 3) at either end of each axis."""
     low, high = points.min(0).values, points.max(0).values
     out = []
     for axis in range(3):
@@ -52,8 +53,8 @@ def faces(points: torch.Tensor) -> torch.Tensor:
     return torch.stack(out)
 
 
-def spread(points: torch.Tensor, count: int) -> torch.Tensor:
-    """At most ``count`` of the points (N, 3), each as far from the others as can be; the first is farthest out."""
+def farthest_points(points: torch.Tensor, count: int) -> torch.Tensor:
+    """At most ``count`` of the points (N, 3) by farthest-point sampling; the first is farthest from their mean."""
     chosen = [points[square_distance(points, points.mean(0)).argmax()]]
     nearest = square_distance(points, chosen[0])
     while len(chosen) < count and nearest.max() > 0:
@@ -62,9 +63,9 @@ def spread(points: torch.Tensor, count: int) -> torch.Tensor:
     return torch.stack(chosen)
 
 
-def cover(points: torch.Tensor, count: int, rounds: int = 10) -> torch.Tensor:
-    """Middles (K, 3), K at most ``count``, of compact parts into which the points (N, 3) fall (Lloyd's algorithm)."""
-    middles = spread(points, count)
+def cluster_centres(points: torch.Tensor, count: int, rounds: int = 10) -> torch.Tensor:
+    """Means (K, 3), K at most ``count``, of clusters of the points (N, 3) (k-means by Lloyd's algorithm)."""
+    middles = farthest_points(points, count)
     for _ in range(rounds):
         part = torch.cdist(points, middles).argmin(1)
         middles = torch.stack([points[part == k].mean(0) for k in range(len(middles)) if (part == k).any()])

@@ -1,0 +1,41 @@
+"""Boundary conditions on one side of planes whose normals and heights are constants."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+
+from masiv.effects.active import ActiveEffects
+from masiv.effects.context import EffectParameter
+from masiv.effects.effect import NodalEffect
+
+
+class PlanesEffect(NodalEffect):
+    """Acts on nodes on one side of ``planes`` planes n_p · x = h_p. Its parameters are n_p and h_p of each plane."""
+
+    strengths = 0
+
+    def __init__(self, planes: int) -> None:
+        self.planes = planes
+        names = (("x", "1"), ("y", "1"), ("z", "1"), ("height", "m"))
+        self.parameters = tuple(
+            EffectParameter(f"{name}{p}", unit, -1e3, 1e3, 1e-3) for p in range(planes) for name, unit in names
+        )
+
+
+@functools.lru_cache(maxsize=16)
+def _planes_effect(kind: type[PlanesEffect], planes: int) -> PlanesEffect:
+    """One object for each kind and number of planes: kernels are compiled for the object."""
+    return kind(planes)
+
+
+def with_planes(
+    effects: ActiveEffects, kind: type[PlanesEffect], normals: torch.Tensor, heights: torch.Tensor
+) -> ActiveEffects:
+    """``effects`` followed by one of ``kind``, so that none of them moves a node that it acts on.
+
+    normals (P, 3): unit vectors; heights (P,) [m]; simulation frame.
+    """
+    planes = torch.cat([normals, heights[:, None]], dim=1).detach().reshape(-1)
+    return ActiveEffects((*effects.members, (_planes_effect(kind, len(heights)), planes)), effects.context)

@@ -1,0 +1,37 @@
+"""The particles at one instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from masiv.errors import InputError
+
+_SHAPES = {"position": (3,), "velocity": (3,), "affine_velocity": (3, 3), "trial_gradient": (3, 3)}
+
+
+@dataclass(frozen=True)
+class State:
+    """Particles at one instant, simulation frame: position, velocity (N, 3) [m, m/s]; affine_velocity (N, 3, 3) [1/s];
+    trial_gradient (N, 3, 3), the elastic deformation gradient before the return mapping."""
+
+    position: torch.Tensor
+    velocity: torch.Tensor
+    affine_velocity: torch.Tensor
+    trial_gradient: torch.Tensor
+
+    def tensors(self) -> tuple[torch.Tensor, ...]:
+        return self.position, self.velocity, self.affine_velocity, self.trial_gradient
+
+    def check(self, count: int) -> None:
+        """Raises InputError if a tensor is not of ``count`` particles."""
+        for name, shape in _SHAPES.items():
+            given = tuple(getattr(self, name).shape)
+            if given != (count, *shape):
+                raise InputError(f"initial state: {name} has shape {given}, the simulator needs {(count, *shape)}")
+
+    @staticmethod
+    def empty(count: int, dtype: torch.dtype) -> State:
+        """Memory for ``count`` particles."""
+        return State(*(torch.empty(count, *shape, dtype=dtype) for shape in _SHAPES.values()))

@@ -1,0 +1,84 @@
+"""What refine leaves in the run folder of tracks: repeatable, reversible, and nothing outside of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+import masiv
+from masiv.pipeline import Overrides, RefineRequest, SceneRequest, SimulateRequest
+from masiv.pipeline.tracks import refine_stem
+
+BALLS = Path(__file__).parent / "golden" / "balls"
+
+
+@pytest.fixture
+def run(tmp_path):
+    opened = masiv.open_run(BALLS, tmp_path / "run")
+    opened.identify()
+    return opened
+
+
+def effects(run) -> list[dict]:
+    return yaml.safe_load((run.path / "twin.yaml").read_text())["effects"]
+
+
+def test_refining_again_gives_the_same_answer_and_the_same_twin(run):
+    first = run.refine(RefineRequest(group=True)).data
+    twin = effects(run)
+    assert first["accepted"]
+    assert twin
+    again = run.refine(RefineRequest(group=True)).data
+    assert again == first
+    assert effects(run) == twin
+
+
+def test_an_answer_without_effects_restores_the_identified_twin(run, tmp_path):
+    identified = effects(run)
+    run.refine(RefineRequest(group=True))
+    assert effects(run) != identified
+    settings = tmp_path / "settings.yaml"
+    settings.write_text(yaml.safe_dump({"refine": {"effects": ["swirl"]}}))
+    other = masiv.reopen_run(run.path, Overrides(config=settings))
+    assert not other.refine(RefineRequest(group=True)).data["accepted"]
+    assert effects(run) == identified
+
+
+def test_a_dry_run_leaves_an_earlier_result_alone(run):
+    run.refine(RefineRequest(group=True))
+    kept = {name: (run.path / name).read_bytes() for name in ("refine.json", "refine.npz", "twin.yaml", "report.html")}
+    ranked = run.refine(RefineRequest(group=True, dry_run=True)).data
+    assert ranked["candidates"]
+    assert not ranked["accepted"]
+    assert {name: (run.path / name).read_bytes() for name in kept} == kept
+    assert json.loads((run.path / "refine.dry_run.json").read_text())["candidates"]
+
+
+@given(st.text(min_size=1), st.text(min_size=1))
+def test_a_condition_names_one_file_inside_the_run_folder(one, other):
+    stems = [refine_stem(condition, "first condition") for condition in (one, other)]
+    assert all(Path(f"{stem}.json").name == f"{stem}.json" for stem in stems)  # no separator in it
+    assert (stems[0] == stems[1]) == (one == other)
+
+
+@pytest.mark.parametrize(
+    ("act", "option"),
+    [
+        (lambda run, out: masiv.open_run(BALLS, out, request=SceneRequest(fit_frames=3)), "--fit-frames"),
+        (lambda run, out: masiv.open_run(BALLS, out, request=SceneRequest(holdout_camera=(0,))), "--holdout-camera"),
+        (lambda run, out: masiv.open_run(BALLS, out, request=SceneRequest(no_silhouette=True)), "--no-silhouette"),
+        (lambda run, out: run.simulate(SimulateRequest(3, view=(0,)), out), "--view"),
+        (lambda run, out: run.simulate(SimulateRequest(3, force_from=0.0), out), "--force-from"),
+        (lambda run, out: run.refine(RefineRequest(second_run=out)), "--second-run"),
+        (lambda run, out: run.evaluate(out), "--truth"),
+    ],
+)
+def test_options_for_pictures_are_refused_and_leave_nothing(run, tmp_path, act, option):
+    with pytest.raises(masiv.InputError, match=option):
+        act(run, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
