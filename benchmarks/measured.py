@@ -117,7 +117,7 @@ def balls(source: Path) -> dict:
 
     tracks = ball_scene(source)
     began = time.perf_counter()
-    refined = refine_group(tracks, "balls", SearchSettings.of(RefineConfig()))
+    refined = refine_group(tracks, "balls", SearchSettings.of(RefineConfig.model_validate({})))
     seconds = time.perf_counter() - began
     simulation, result = refined.forward_model, refined.search
     first = {t.candidate.effect: t for t in result.rounds[0].trials}
@@ -140,7 +140,8 @@ def balls(source: Path) -> dict:
         for t in terms
     }  # fmt: skip
     return {
-        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows, "refused": {n: b.objections for n, b in refined.bodies.items() if b.objections},
+        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows,
+        "refused": {n: b.objections for n, b in refined.bodies.items() if b.objections},
         "shared": [
             {"bodies": s.term.bodies,
              "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.term.effect)},

@@ -25,10 +25,11 @@ from masiv.models.families import family_of
 from masiv.models.marked_body import marked_body
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
-from masiv.refine.add_effect import refit
 from masiv.refine.candidates import score
 from masiv.refine.config import RefineConfig
-from masiv.refine.search import search_effects
+from masiv.refine.effect_fit import fit_with_effect
+from masiv.refine.search_state import SearchSettings
+from masiv.refine.stage import refine
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.read import read_tracks
 
@@ -96,6 +97,12 @@ def quiet(*_):
     """No progress."""
 
 
+def settings(**changes):
+    """Of a search for one effect; a smooth force for the rest would take long."""
+    config = RefineConfig.model_validate({"max_effects": 1, **changes})
+    return SearchSettings.of(config, discrepancy_force=False)
+
+
 @pytest.fixture(scope="module")
 def bar(tmp_path_factory):
     runs = [("own_a", "", "fit"), ("own_b", "", "hold_out"), ("load_a", "load", "fit"), ("load_b", "load", "hold_out")]
@@ -110,16 +117,15 @@ def test_damping_is_found_and_the_law_with_it(bar):
     )
     base = fit_law(simulation, family_of("neo_hookean", 1070, known), TRACKS, quiet)
     assert base.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.15)
-    config = RefineConfig(max_effects=1, shortlist=2, unexplained=1e9)  # no stop-gap, which takes long
-    result = search_effects(simulation, [base], config, quiet)
+    result = refine(simulation, [base], settings(shortlist=3))
     after = result.after
     assert after.model.effects == ("viscosity",)
     assert after.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.02)
     assert after.values["viscosity.viscosity"] == pytest.approx(VISCOSITY, rel=0.1)
     assert after.held_out_mm < 0.1
     assert after.held_out_mm < 0.25 * result.before.held_out_mm
-    drag = [t for t in result.rounds[0].trials if t.candidate.effect == "linear_drag"]
-    assert all(any("it takes a medium of" in reason for reason in t.reasons) for t in drag)
+    drag = [t for t in result.search.rounds[0].trials if t.effect == "linear_drag"]
+    assert [any("it takes a medium of" in why for why in t.objections) for t in drag] == [True]
 
 
 @pytest.mark.slow
@@ -129,13 +135,12 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     family = family_of("neo_hookean", 1070, known)
     base = gauss_newton_fit(simulation, Model(family, "none", ("viscosity",)), {}, budget=4)
     assert simulation.curriculum(base)  # its phase is lost
-    config = RefineConfig(max_effects=1, shortlist=1, unexplained=1e9)
-    result = search_effects(simulation, [base], config, quiet)
+    result = refine(simulation, [base], settings(shortlist=1))
     after = result.after
     assert after.model.effects == ("viscosity", "point_mass")
     assert after.values["point_mass.mass"] == pytest.approx(LOAD, rel=0.05)
     assert after.held_out_mm < 0.2 < 0.1 * result.before.held_out_mm
-    share = {c.effect: c.explained for c in result.rounds[0].candidates}
+    share = {c.effect: c.explained for c in result.search.rounds[0].candidates}
     assert 1 - share["point_mass"] < 0.2 * (1 - share["gravity_scale"])
 
 
@@ -203,9 +208,9 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
     )
     assert simulation.is_out_of_phase(base)
     assert not simulation.curriculum(base)
-    (found,) = score(simulation, base, robust_scale=1e-3, names=["point_mass"])
+    (found,) = score(simulation, base, ["point_mass"], robust_scale=1e-3).candidates
     assert found.finite
-    after = refit(simulation, base, found, 1e-3)
+    after = fit_with_effect(simulation, base, found, 1e-3)
     assert after.values["point_mass.z"] == places[-1][2]
     assert after.values["point_mass.mass"] == pytest.approx(LOAD, rel=0.1)
     assert after.fit_mm < 0.2 < 0.1 * base.fit_mm

@@ -24,6 +24,7 @@ from masiv.simulation.fitted_twin import law_values
 from masiv.tracks.placement import Placement
 from masiv.tracks.tracks import Clamp
 from masiv.twin import Body, Boundary, InitialCondition, Release, Twin, TwinEffect
+from masiv.twin.body import OFFSET_UNITS
 from masiv.twin.identified import IDENTIFIED_FILE, load_identified, load_to_refine, restore_identified, save_refined
 
 SCHEMA1 = Path(__file__).parent / "data/twin_schema1"
@@ -78,7 +79,11 @@ def twins(draw):
     starts = []
     for index, body in enumerate(known):
         placement = Placement(np.eye(3), draw(vectors), draw(st.floats(0, 1)))
-        release = Release({"tip": draw(vectors)}, draw(st.floats(0, 100)), {"release": draw(numbers)})
+        release = Release(
+            {"tip": draw(vectors)},
+            draw(st.floats(0, 100)),
+            {name: draw(numbers) for name in OFFSET_UNITS if draw(st.booleans())},
+        )
         starts.append(
             InitialCondition(
                 f"run {index}",
@@ -181,8 +186,8 @@ def test_a_clamped_body_of_schema_1(tmp_path):
     own, load = twin.initial_conditions
     assert own.release is not None
     assert load.release is not None
-    assert list(own.release.offsets.values()) == [0.0012, 1.5e-4, -2e-5]
-    assert list(load.release.offsets.values()) == [-0.0004]
+    assert own.release.offsets == {"release": 0.0012, "lateral_offset_1": 1.5e-4, "lateral_offset_2": -2e-5}
+    assert load.release.offsets == {"release": -0.0004}
     viscosity, mass = twin.effects
     assert (viscosity.condition, mass.condition, mass.place) == (None, "load", (0.001, -0.002, 0.049))
     assert mass.rows()[-1] == ("z", 0.049, "m", None)

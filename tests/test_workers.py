@@ -29,10 +29,10 @@ from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import InitialState
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
-from masiv.refine.baselines import DONE, baselines, derived
+from masiv.refine.baselines import ALL_FRAMES_STAGE, baselines, differentiated
 from masiv.refine.config import RefineConfig
 from masiv.refine.prepare import prepare
-from masiv.refine.tasks import map_tasks, ranked
+from masiv.refine.tasks import map_tasks, rank
 from masiv.workers import TaskError, Workers, process_count, unwrap
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -260,17 +260,17 @@ def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
         f"{n}_{a}": v for n, vs in (("velocity", VELOCITY), ("omega", OMEGA)) for a, v in zip("xyz", vs, strict=True)
     }
     checkpoint = Checkpoint(tmp_path / "refine.pt")
-    done = FamilyFit("neo_hookean", "sticky", {**law, **throw, "ground_offset": 0.0}, stage=DONE)
+    done = FamilyFit("neo_hookean", "sticky", {**law, **throw, "ground_offset": 0.0}, stage=ALL_FRAMES_STAGE)
     checkpoint.save({"neo_hookean": done.state()})
     unused: Any = None
-    (fitted,) = baselines(simulation, unused, unused, 1, config, checkpoint, quiet)
+    (fitted,) = baselines(simulation, unused, config, checkpoint, quiet, Workers())
     assert {n: fitted.values[n] for n in law} == law
     assert fitted.model.contact == "sticky"
 
 
 @pytest.mark.slow
 def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
-    monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
+    monkeypatch.setattr("masiv.refine.tasks.EFFECTS_PER_TASK", 1)
     simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
     values = {p.name: p.start for p in simulation.parameters(model)}
@@ -281,8 +281,8 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     found = []
     for workers in (Workers(1), two):
         before = simulation.rollouts
-        (base,) = map_tasks(workers, simulation, derived, [(model, values, 0)])
-        ranking = ranked(workers, simulation, base, robust_scale=1.0, names=names, progress=quiet)
+        (base,) = map_tasks(workers, simulation, differentiated, [(model, values, 0)])
+        ranking = rank(workers, simulation, base, names, robust_scale=1.0, progress=quiet).candidates
         found.append((base, ranking, simulation.rollouts - before))
     (base, ranking, count), (other_base, other, other_count) = found
     assert count == other_count == len(base.parameters) + 2 + len(names)

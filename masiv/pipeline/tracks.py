@@ -208,7 +208,7 @@ class TracksRun(Run):
                     error = row.pop("rmse_mm")
                     rows.setdefault(row["run"], row)[f"{name}_mm"] = error
         progress("report: simulate", len(conditions), len(conditions))
-        arrays = {f"{key}@{name}": value for name, own in curves.items() for key, value in own.items()}
+        arrays: dict[str, Any] = {f"{key}@{name}": value for name, own in curves.items() for key, value in own.items()}
         write_npz(self.path / "rollout.npz", **arrays)
         errors = list(rows.values())
         write_json(

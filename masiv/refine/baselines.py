@@ -66,8 +66,8 @@ LABEL = "refine: laws without effects"
 
 
 def _shortlist(
-    forward_model: FreeBodyModel, problem: BaselineProblem, kinds: Sequence[str], config: RefineConfig, progress: Progress,
-    workers: Workers,
+    forward_model: FreeBodyModel, problem: BaselineProblem, kinds: Sequence[str], config: RefineConfig,
+    progress: Progress, workers: Workers,
 ) -> list[str]:  # fmt: skip
     """The laws that are best in a short fit."""
     motion = forward_model.setups[0].start

@@ -255,11 +255,11 @@ def _proposal(proposal: Proposal) -> dict[str, Any]:
 # -- refine.npz ------------------------------------------------------------------------------------------------------
 
 
-def arrays(result: RefineResult) -> dict[str, np.ndarray]:
+def arrays(result: RefineResult) -> dict[str, Any]:
     """refine.npz: ``observations``, their names; and of each, named ``key@observation``, ``times`` (T,) [s], ``points``
     (N, 3) [m] at the start, ``observed``, ``before`` and ``after`` (T, N, A) [m], the last two simulated less observed,
     and ``fit_count``, how many instants were fitted. World frame, along the A axes that were measured."""
-    out: dict[str, np.ndarray] = {"observations": np.array([e.name for e in result.observations])}
+    out: dict[str, Any] = {"observations": np.array([e.name for e in result.observations])}
     for e, before, after in zip(result.observations, result.before.fields, result.after.fields, strict=True):
         own = {
             "times": e.times,

@@ -63,7 +63,7 @@ def refine_tracks(
 
 def check_config(config: Config) -> None:
     """Raises InputError for a setting that says nothing of tracks and is not the default: it would be ignored."""
-    default = RefineConfig()
+    default = RefineConfig.model_validate({})
     for key, instead in NOT_FOR_TRACKS.items():
         if getattr(config.refine, key) != getattr(default, key):
             raise InputError(f"refine.{key} is for scenes of pictures: leave it out, tracks have {instead}")

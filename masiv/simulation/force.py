@@ -29,8 +29,8 @@ class ForcePulse:
             raise InputError(f"--force-until {self.stop:g} must be later than --force-from {self.start:g}")
 
     def pieces(self, begin: float, end: float) -> list[tuple[float, bool]]:
-        """The time from ``begin`` to ``end`` [s], cut where the force comes or goes: (duration [s], does it act)."""
-        shortest = 1e-6 * (end - begin)  # a sliver of time is the error of a float, not a piece
+        """The interval from ``begin`` to ``end`` [s], cut where the force starts or stops: (duration [s], acts?)."""
+        shortest = 1e-6 * (end - begin)  # anything shorter is a rounding error
         inside = [t for t in (self.start, self.stop) if begin + shortest < t < end - shortest]
         cuts = [begin, *inside, end]
         return [(b - a, self.start < 0.5 * (a + b) < self.stop) for a, b in itertools.pairwise(cuts)]

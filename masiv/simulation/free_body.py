@@ -11,8 +11,8 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.errors import InputError, NonFiniteError
+from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.design import grid_spacing, substeps_per_frame
-from masiv.mpm.rollout import at_rest
 from masiv.mpm.simulator import Simulator
 from masiv.mpm.state import State
 from masiv.progress import Progress, silent
@@ -22,20 +22,6 @@ from masiv.simulation.rollout import Rollout
 from masiv.simulation.subdivide import subdivide_twin
 from masiv.simulation.twin_effects import active_effects, mass_ratio, shift_effects
 from masiv.twin import Twin
-
-
-def skew(omega: torch.Tensor) -> torch.Tensor:
-    """The matrix W (3, 3) with W r = omega x r."""
-    x, y, z = omega.unbind()
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-
-
-def rigid_initial_state(position: torch.Tensor, velocity: torch.Tensor, omega: torch.Tensor) -> State:
-    """An undeformed body (N, 3) [m] with the velocity (3,) [m/s] of its centroid and a spin (3,) [rad/s] about it."""
-    spin = skew(omega)
-    arm = position - position.mean(0)
-    return at_rest(position, velocity + arm @ spin.T, spin.expand(len(position), 3, 3))
 
 
 def simulate_free_body(

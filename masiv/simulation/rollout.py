@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Rollout:
 
     def save(self, path: Path) -> None:
         """Write ``path`` (.npz), complete or not at all."""
-        arrays = {"positions": self.positions, "times": self.times}
+        arrays: dict[str, Any] = {"positions": self.positions, "times": self.times}
         if self.markers is not None:
             arrays |= {"markers": self.markers, "marker_names": np.array(self.marker_names)}
         write_npz(path, **arrays)

@@ -1,8 +1,8 @@
 """More particles for a prediction than for its fit, on the same grid.
 
-A particle is one point of a quadrature of the body. Where matter is stretched until neighbours lie more than about a
-cell apart, the grid between them feels nothing and the body tears, whatever its law: numerical fracture, which thin
-parts suffer first. Four points in place of one put that off, and cost one rollout instead of a whole fit.
+A particle is a quadrature point of the body. If matter is stretched until neighbouring particles are more than about a
+cell apart, no force acts across the grid nodes between them: the body tears, whatever its law (numerical fracture),
+thin parts first. Four points in place of one delay that, at the cost of one rollout instead of a whole fit.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from masiv.twin import Body, Twin
 
 
 def extent(position: torch.Tensor) -> float:
-    """Size [m] of a body of particles (N, 3): twice the distance from their middle that nine tenths keep."""
+    """Size [m] of a body of particles (N, 3): twice the 90 % quantile of their distances from the centroid."""
     return float((position - position.mean(0)).norm(dim=1).quantile(0.9)) * 2
 
 

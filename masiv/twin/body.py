@@ -53,13 +53,23 @@ class Boundary:
     friction: float = 0.0
 
 
+OFFSET_UNITS = {
+    "release": "s",
+    "lateral_offset_1": "m",
+    "lateral_offset_2": "m",
+    "vertical_offset": "m",
+    "tip_deflection": "m",
+}
+"""How much later a body is let go than its markers show, how far from its rest it is held along two horizontal axes and
+the vertical one, and how far its tip is bent, see ``masiv.models.clamped_body``."""
+
+
 @dataclass(frozen=True)
 class Release:
     """The start of a body that is held at rest and then let go.
 
     markers: rest position (3,) [m] of each marker that moves with the material. max_speed [m/s]: the greatest that was
-    observed, from which the substep follows. offsets: fitted corrections: ``release`` [s], how much later it is let go;
-    ``aside_1``, ``aside_2``, ``above``, ``lift`` [m], see ``masiv.models.clamped_body``.
+    observed, from which the substep follows. offsets: what was fitted of the start, see ``OFFSET_UNITS``.
     """
 
     markers: dict[str, np.ndarray]

@@ -18,7 +18,7 @@ from masiv.scene.scene import Ground
 from masiv.strict import read_yaml, validated
 from masiv.tracks.placement import Placement
 from masiv.tracks.tracks import Clamp
-from masiv.twin.body import Body, Boundary, InitialCondition, Release, TwinEffect
+from masiv.twin.body import OFFSET_UNITS, Body, Boundary, InitialCondition, Release, TwinEffect
 
 SCHEMA = 2
 TWIN_FILE = "twin.yaml"
@@ -119,15 +119,20 @@ class PlacementPart(Part):
     error: Scalar[Literal["m"]]
 
 
-class OffsetPart(Part):
-    value: float
-    unit: Literal["s", "m"]
+class OffsetsPart(Part):
+    """Those of ``OFFSET_UNITS``."""
+
+    release: Scalar[Literal["s"]] | None = None
+    lateral_offset_1: Scalar[Literal["m"]] | None = None
+    lateral_offset_2: Scalar[Literal["m"]] | None = None
+    vertical_offset: Scalar[Literal["m"]] | None = None
+    tip_deflection: Scalar[Literal["m"]] | None = None
 
 
 class ReleasePart(Part):
     markers: dict[str, Vector3[Literal["m"]]]
     max_speed: Scalar[Literal["m/s"]]
-    offsets: dict[str, OffsetPart]
+    offsets: OffsetsPart
 
 
 class InitialConditionPart(Part):
@@ -233,10 +238,7 @@ def _initial_condition_entry(start: InitialCondition) -> dict[str, Any]:
         release = {
             "markers": {name: _quantity(place, "m") for name, place in start.release.markers.items()},
             "max_speed": _quantity(start.release.max_speed, "m/s"),
-            "offsets": {
-                name: _quantity(value, "s" if name == "release" else "m")
-                for name, value in start.release.offsets.items()
-            },
+            "offsets": {name: _quantity(value, OFFSET_UNITS[name]) for name, value in start.release.offsets.items()},
         }
     return {
         "observation": start.observation,
@@ -356,7 +358,7 @@ def _initial_condition(part: InitialConditionPart) -> InitialCondition:
         p = part.placement
         placement = Placement(np.array(p.rotation), np.array(p.translation.value), p.error.value)
     if part.release is not None:
-        offsets = {name: offset.value for name, offset in part.release.offsets.items()}
+        offsets = {name: offset.value for name, offset in part.release.offsets if offset is not None}
         markers = {name: np.array(place.value) for name, place in part.release.markers.items()}
         release = Release(markers, part.release.max_speed.value, offsets)
     return InitialCondition(

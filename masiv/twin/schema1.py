@@ -18,6 +18,13 @@ from masiv.twin.document import EffectPart, check_names, read_effect, read_parti
 
 BODY, OBSERVATION = "body", "observation"
 """Names for what had none."""
+RENAMED = {
+    "aside_1": "lateral_offset_1",
+    "aside_2": "lateral_offset_2",
+    "above": "vertical_offset",
+    "lift": "tip_deflection",
+}
+"""What was fitted of the start of a run."""
 
 
 def read_schema1(data: Mapping[str, Any], path: Path, scene: Callable[[], Mapping[str, Any]] | None) -> dict[str, Any]:
@@ -71,7 +78,10 @@ def _of_tracks(data: Mapping[str, Any], path: Path, scene: dict[str, Any]) -> di
         law = ClassicalLaw(kind, **{name: float(row["value"]) for name, row in rows.items()})
         law.stderr = {name: float(row["stderr"]) for name, row in rows.items() if row["stderr"] is not None}
         bodies = tuple(replace(body, law=law) for body in bodies)
-    values = {str(name): float(value) for name, value in data["starts"].items()}
+    values = {}
+    for name, value in data["starts"].items():
+        what, run = str(name).split("@", 1)
+        values[f"{RENAMED.get(what, what)}@{run}"] = float(value)
     starts = tuple(with_start_values(start, values) for start in scene["initial_conditions"])
     effects = _effects(data["effects"], path, bodies, starts)
     return {**scene, "bodies": bodies, "initial_conditions": starts, "effects": effects, "fit": data["fit"]}

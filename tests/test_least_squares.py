@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from masiv.errors import MasivError, NonFiniteError
-from masiv.inference.least_squares import gauss_newton
+from masiv.inference.least_squares import broyden, derivative, gauss_newton, gauss_newton_jump, linearize
+from masiv.inference.robust import soft_l1_mean_square, soft_l1_sum
 from masiv.models.parameters import Parameter
 
 TIMES = np.linspace(0, 2, 200)
@@ -157,3 +159,79 @@ def test_the_same_call_gives_the_same_bits():
     first, second = run(), run()
     assert first.values == second.values
     assert np.array_equal(first.covariance, second.covariance)
+
+
+# -- with a Jacobian that is known -----------------------------------------------------------------------------------
+
+
+def linear_problem(matrix, truth):
+    """Residual of a linear model, and its parameters a and b, b at most 2."""
+    target = matrix @ np.array(truth)
+    bounds = [Parameter("a", 0.0, -100.0, 100.0, 1e-3), Parameter("b", 0.0, -100.0, 2.0, 1e-3)]
+    return (lambda v: matrix @ np.array([v["a"], v["b"]]) - target), bounds
+
+
+@pytest.mark.parametrize(("truth", "reached"), [([40.0, -7.0], [40.0, -7.0]), ([3.0, 50.0], None)])
+def test_a_jump_ends_in_the_minimum_however_far_and_within_bounds(truth, reached):
+    matrix = np.random.default_rng(0).normal(size=(30, 2))
+    residual, parameters = linear_problem(matrix, truth)
+    start = linearize(residual, parameters, {"a": 0.0, "b": 0.0})
+    np.testing.assert_allclose(start.jacobian, matrix, atol=1e-9)
+    here = gauss_newton_jump(residual, parameters, start, robust_scale=1e6)
+    np.testing.assert_allclose(here.residual, residual(here.values))
+    if reached is None:
+        assert here.values["b"] == 2.0
+    else:
+        assert [here.values["a"], here.values["b"]] == pytest.approx(reached, rel=1e-2)
+        np.testing.assert_allclose(here.jacobian, matrix, atol=1e-9)  # it was exact, and stays so
+
+
+def test_broyden_reaches_a_minimum_with_a_jacobian_that_was_wrong():
+    matrix = np.random.default_rng(2).normal(size=(30, 2))
+    residual, parameters = linear_problem(matrix, [0.02, -0.015])
+    start = linearize(residual, parameters, {"a": 0.0, "b": 0.0})
+    wrong = replace(start, jacobian=start.jacobian @ np.array([[1.0, 0.6], [0.2, 1.4]]))
+    calls = []
+
+    def counted(values):
+        calls.append(values)
+        return residual(values)
+
+    here = broyden(counted, parameters, wrong, steps=12, robust_scale=1e6)
+    assert len(calls) <= 12
+    assert np.linalg.norm(here.residual) < 1e-2 * np.linalg.norm(start.residual)
+    np.testing.assert_allclose(here.residual, residual(here.values))
+
+
+def test_broyden_goes_round_what_diverges():
+    matrix = np.random.default_rng(3).normal(size=(30, 2))
+    residual, parameters = linear_problem(matrix, [0.006, 0.0])
+
+    def bounded(values):
+        if values["a"] > 0.007:
+            raise NonFiniteError(0, 0, "too fast")
+        return residual(values)
+
+    start = linearize(residual, parameters, {"a": 0.0, "b": 0.0})
+    too_flat = replace(start, jacobian=0.5 * start.jacobian)  # its first step goes twice as far as it should
+    here = broyden(bounded, parameters, too_flat, steps=12, robust_scale=1e6)
+    assert here.values["a"] == pytest.approx(0.006, rel=0.05)
+
+
+def test_a_derivative_that_diverges_on_both_sides_is_an_error():
+    def residual(values):
+        if values["x"] != 1.0:
+            raise NonFiniteError(0, 0, "too fast")
+        return np.ones(2)
+
+    with pytest.raises(NonFiniteError, match="both sides of x"):
+        derivative(residual, {"x": 1.0}, np.ones(2), Parameter("x", 1.0, 0, 2, 0.1))
+
+
+def test_the_two_robust_costs_differ_in_scale_alone():
+    residual = np.random.default_rng(5).normal(0, 2e-3, 50)
+    for scale in (1e-3, 1e-2):
+        per_sample = soft_l1_sum(residual, scale) / len(residual)
+        assert soft_l1_mean_square(residual, scale) == pytest.approx(2 * scale**2 * per_sample)
+    assert soft_l1_mean_square(residual, 1e3) == pytest.approx(float((residual**2).mean()), rel=1e-6)
+    assert soft_l1_sum(residual, math.inf) == pytest.approx(float(residual @ residual))
