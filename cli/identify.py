@@ -36,8 +36,8 @@ def identify(
         list[Path] | None,
         typer.Option(
             "--also",
-            help="Run folder of another throw of the same object (masiv trajectory has made it), from which a neural "
-            "law is learnt, too. May be given several times.",
+            help="Run folder of another recording of the same object, made by masiv trajectory: a neural law is fitted "
+            "to all of them. May be given several times.",
         ),
     ] = None,
     geometry_loss: Annotated[
@@ -66,7 +66,7 @@ def identify(
 
     A scene of tracks (measured points, no pictures) starts with the law: `masiv identify scenes/beam`
 
-    One law from several throws: `masiv identify scenes/egg_1 --out runs/egg_1 --also runs/egg_2 --also runs/egg_3`
+    One law from several recordings: `masiv identify scenes/egg_1 --out runs/egg_1 --also runs/egg_2 --also runs/egg_3`
 
     A classical baseline: `masiv identify scenes/bunny --out runs/bunny-elastic --law neo_hookean`
     """

@@ -28,15 +28,16 @@ RENAMED_KEYS = {
     "trajectory.carve_misses": "carve_images",
     "trajectory.batch": "batch_size",
     "trajectory.match_every": "match_interval",
-    "tracks.highest_poissons_ratio": "max_poissons_ratio",
     "identify.polish": "surface_finetune",
     "identify.polish_silhouette_weight": "finetune_silhouette_weight",
     "identify.paint_weight": "color_weight",
     "identify.polish_paint_weight": "finetune_color_weight",
+    "tracks.highest_poissons_ratio": "max_poissons_ratio",
 }
 """Keys of earlier versions: section and old name -> new name in the same section."""
 RENAMED_VALUES = {"identify.start": RENAMED_STARTS}
-"""Values of earlier versions: section and key -> old value -> new value."""
+"""Values of earlier versions by section and key: old value -> new value."""
+
 Preset = Literal["quick", "standard", "paper"]
 DEFAULT_PRESET = "standard"
 
@@ -101,8 +102,8 @@ def renamed_keys(config: Mapping[str, Any]) -> dict[str, Any]:
     for name, renamed in RENAMED_VALUES.items():
         section, key = name.split(".")
         values = result.get(section)
-        if isinstance(values, dict) and key in values:
-            values[key] = renamed.get(values[key], values[key])
+        if isinstance(values, dict) and values.get(key) in renamed:
+            values[key] = renamed[values[key]]
     return result
 
 

@@ -31,22 +31,6 @@ def test_a_new_run_says_what_was_asked(tmp_path):
     assert (run.fit_frames, run.holdout_cameras) == (12, (3,))
 
 
-def test_a_run_of_an_older_version_is_read_and_resumed(tmp_path):
-    run = RunFolder.create_or_resume(tmp_path / "run", request(tmp_path, identify__start="maxwell_fluid"))
-    with run.stage("identify"):
-        pass
-    record = yaml.safe_load((run.path / "run.yaml").read_text())
-    section = record["config"]["identify"]
-    section["start"] = "honey"
-    section["polish"] = section.pop("surface_finetune")
-    (run.path / "run.yaml").write_text(yaml.safe_dump(record))
-    assert RunFolder.open(run.path).config["identify"]["start"] == "maxwell_fluid"
-    RunFolder.create_or_resume(run.path, request(tmp_path, identify__start="maxwell_fluid"))
-    written = yaml.safe_load((run.path / "run.yaml").read_text())["config"]["identify"]
-    assert "polish" not in written
-    assert written["surface_finetune"] is True
-
-
 def test_stage_goes_pending_running_done(tmp_path):
     run = RunFolder.create_or_resume(tmp_path / "run", request(tmp_path))
     with run.stage("reconstruct") as checkpoint:

@@ -50,7 +50,7 @@ def fit_neural_law(
         if "starts" in saved:
             starts = [StartingLaw.from_state(state) for state in saved["starts"]]
         else:
-            workers.begin()
+            workers.start()
             starts = _starts_to_fit(choose_starting_laws(coarse(), recordings[0].initial_state, progress, workers))
         nested = NestedCheckpoint(checkpoint, {"starts": [start.state() for start in starts]})
         if "starts" not in saved:

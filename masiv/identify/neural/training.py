@@ -203,7 +203,7 @@ def _whole_rollout(
 def _prior_loss(law: NeuralLaw | AdapterLaw, prior: NeuralLaw | AdapterLaw, weight: float) -> torch.Tensor:
     """``weight`` times the distance () of a neural law from ``prior``; 0 for an adapter."""
     if isinstance(law, NeuralLaw) and isinstance(prior, NeuralLaw) and weight:
-        return weight * law.departure(prior)
+        return weight * law.prior_distance(prior)
     return torch.zeros(())
 
 
