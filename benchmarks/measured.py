@@ -31,7 +31,7 @@ MARKERS_AT = {"tip1": [36, 15, 0], "tip2": [24, -6, 0], "tip3": [6, 36, 0],
 BEAM_AT_REST = {("gravity", "a"): [20, 60], ("gravity", "b"): [20, 55],
                 ("load52", "a"): [10, 35], ("load52", "b"): [10, 45]}  # fmt: skip
 """Frames in which the beam is held straight."""
-LOAD_UNSTEADY = 0.1
+LOAD_IGNORED = 0.1
 """How long [s] after the release the loaded tip stops and goes (0.31, 0.18, 0.37 m/s after 28, 48 and 68 ms)."""
 
 
@@ -74,12 +74,12 @@ def write_beam(source: Path, out: Path) -> Path:
     _link(source / "beam.stl", out)
     runs = []
     for kind, condition in (("gravity", ""), ("load52", "load52")):
-        unsteady = {} if not condition else {"unsteady": LOAD_UNSTEADY}
+        ignored = {} if not condition else {"ignore_after_release": LOAD_IGNORED}
         for repeat, use in (("a", "fit"), ("b", "hold_out")):
             name = f"beam_{kind}_V2_{repeat}.csv"
             _link(source / name, out)
             runs.append({"file": name, "name": f"{kind}_{repeat}", "condition": condition, "use": use,
-                         "rest_frames": BEAM_AT_REST[kind, repeat], **unsteady})  # fmt: skip
+                         "rest_frames": BEAM_AT_REST[kind, repeat], **ignored})  # fmt: skip
     body = {
         "density": 1070,
         "poissons_ratio": 0.499,

@@ -82,26 +82,28 @@ def test_relaxation_time_of_a_maxwell_body():
     assert curves.relaxation_time(classical("jelly"), 0.1) is None
 
 
-def test_a_tabulated_law_is_the_law():
+def test_a_frozen_law_is_the_law():
     law = pretrained("plasticine").double()
     f = torch.eye(3).double() + 0.1 * torch.randn(20, 3, 3, generator=torch.Generator().manual_seed(1)).double()
-    known = curves.tabulated(law)
+    known = law.frozen()
     torch.testing.assert_close(known.project(f, 1e-3), law.project(f, 1e-3).detach(), rtol=0, atol=0)
     torch.testing.assert_close(known.stress(f), law.stress(f).detach(), rtol=0, atol=0)
 
 
-def test_an_exact_classical_law_finds_its_coefficients_once_a_step(monkeypatch):
-    asked, coefficients = [], ClassicalLaw.coefficients
-
-    def counted(law, dt):
-        asked.append(dt)
-        return coefficients(law, dt)
-
-    monkeypatch.setattr(ClassicalLaw, "coefficients", counted)
-    law = curves.exact(ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=1e3))
+def test_a_frozen_law_computes_its_tables_and_coefficients_once():
+    law = curves.in_float64(ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=1e3))
+    assert law.coefficients(1e-3) is law.coefficients(1e-3)
+    assert law.coefficients(1e-3) is not law.coefficients(1e-4)
+    neural = pretrained("plasticine")
+    assert neural.flow_table(1e-3) is not neural.flow_table(1e-3)  # its parameters may change
+    frozen = neural.frozen()
+    assert frozen.moduli_table() is frozen.moduli_table()
+    assert frozen.flow_table(1e-3) is frozen.flow_table(1e-3)
+    for k in range(100):  # what is remembered is bounded
+        frozen.flow_table(1e-3 + 1e-5 * k)
+    assert len(frozen._known) <= 16
     path = curves.simple_shear(np.linspace(0, 0.2, 5))[:, None]
     slow, quick = (curves.drive(law, path, dt)[1] for dt in (1e-3, 1e-4))
-    assert asked == [1e-3, 1e-4]
     torch.testing.assert_close(slow, quick, rtol=0, atol=0)  # its yield knows no rate
 
 

@@ -170,7 +170,7 @@ def test_a_static_deflection_strains_as_it_moves(bar):
 
 def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
-    skipped = replace(bar, runs=tuple(replace(run, unsteady=0.05) for run in bar.runs))
+    skipped = replace(bar, runs=tuple(replace(run, ignore_after_release=0.05) for run in bar.runs))
     simulation = simulation_of(skipped, "", TRACKS, SIMULATOR, known=known)
     run = next(r for r in simulation.observations if not r.fitted)
     assert run.times[0] >= 0.05
@@ -197,7 +197,7 @@ def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
 def test_load_is_found_where_the_release_is_not_seen(bar):
     """Out of phase, and with no first moments to count from: from none, its derivative would lead elsewhere."""
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
-    fitted = tuple(replace(run, unsteady=0.04) for run in bar.runs if run.purpose == "fit")
+    fitted = tuple(replace(run, ignore_after_release=0.04) for run in bar.runs if run.purpose == "fit")
     simulation = simulation_of(replace(bar, runs=fitted), "load", TRACKS, SIMULATOR, known=known)
     term = simulation.term("point_mass")
     places = tuple(sorted(term.guesses, key=lambda place: place[2]))  # along the bar, from the clamp

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import multiprocessing
 import os
-import pickle
 import sys
 import time
 from typing import Any
@@ -234,14 +232,6 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
         assert (a.material, a.contact, a.objective) == (b.material, b.contact, b.objective)
         for name, value in a.law.state_dict().items():
             assert torch.equal(value, b.law.state_dict()[name])
-
-
-def test_a_scene_goes_to_a_process_without_the_pictures_that_were_read():
-    read = scene()
-    read._cache[0, 0] = "a picture"
-    sent = pickle.loads(pickle.dumps(dataclasses.replace(read, load=halved)))
-    assert sent._cache == {}
-    assert sent.path == read.path
 
 
 def small_simulation():

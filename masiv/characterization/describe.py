@@ -71,7 +71,7 @@ def describe(law: Law, excited: Excited, *, substep: float = 5e-4) -> Material:
     Moduli are those of the stress at F = I. Yield is where 0.2 % of an axial strain with free sides is permanent: the
     0.2 % offset without its assumption that unloading follows the slope at rest, which no large strain does.
     """
-    law = curves.exact(law)
+    law = curves.in_float64(law)
     strain = float(np.clip(excited.strain[1], SMALLEST, LARGEST))
     log_volume = min(excited.log_volume[0], -2e-3), max(excited.log_volume[1], 2e-3)
     rate = max(excited.rate, strain / (POINTS * 2 * substep))  # slower loading would flow in too long steps
@@ -272,7 +272,7 @@ def _drawn(
 
     family = None
     if nearest.parameters:
-        family = curves.exact(ClassicalLaw(nearest.kind, **{n: v["value"] for n, v in nearest.parameters.items()}))
+        family = curves.in_float64(ClassicalLaw(nearest.kind, **{n: v["value"] for n, v in nearest.parameters.items()}))
     reach = WIDER * strain
     steps = np.arange(1, POINTS + 1) / POINTS
     shear = curves.there_and_back(math.sqrt(3) * reach, POINTS)

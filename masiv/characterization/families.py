@@ -41,7 +41,7 @@ def nearest_families(law: Law, *, strain: float, log_volume: tuple[float, float]
     The paths go there and back: shear at rest volume and compressed to log_volume[0], stretch and compression at
     constant volume, all to the equivalent ``strain``, and changes of volume to ``log_volume``, at ``rate`` [1/s].
     """
-    law = curves.exact(law)
+    law = curves.in_float64(law)
     dt = strain / (rate * POINTS)
     fine = _paths(strain, log_volume, POINTS * REFINED)
     target = curves.drive(law, fine, dt / REFINED)[1][REFINED - 1 :: REFINED]
@@ -108,7 +108,7 @@ def _matched(
         return {name: back(float(v)) for name, (_, back), v in zip(names, ways, x, strict=True)}
 
     def residual(x: np.ndarray) -> np.ndarray:
-        stress = curves.drive(curves.exact(ClassicalLaw(kind, **values(x))), paths, dt)[1]
+        stress = curves.drive(curves.in_float64(ClassicalLaw(kind, **values(x))), paths, dt)[1]
         every = len(stress) // len(target)
         stress = stress[every - 1 :: every]
         off = (stress - target) / (scale * math.sqrt(len(target) * target.shape[1]))

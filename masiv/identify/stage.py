@@ -110,10 +110,10 @@ def relearn(
     coarse = _coarse(scene, trajectory, recording, seed)
     with runtime.torch_threads(1):
         result = fit_neural_law([recording], coarse, seed, checkpoint or Checkpoint(None), progress)
-    state = result.initial_state
-    velocity, omega = (axes.vectors_to_world(v.double().numpy()) for v in (state.velocity, state.omega))
+    fitted = result.initial_state
+    velocity, omega = (axes.vectors_to_world(v.double().numpy()) for v in (fitted.velocity, fitted.omega))
     learned = twin.with_body(law=result.law).with_motion(velocity=velocity, omega=omega)
-    learned = learned.with_boundary(ground=state.ground(scene.ground), contact=result.contact)
+    learned = learned.with_boundary(ground=fitted.ground(scene.ground), contact=result.contact)
     errors = {"trajectory_error_mm": 1e3 * result.trajectory_error, "history": result.history}
     return replace(learned, fit={**twin.fit, **result.report, **errors})
 

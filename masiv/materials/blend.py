@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from masiv.characterization.curves import tabulated
 from masiv.errors import InputError, MasivError
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.law import BoundLaw, Law
@@ -126,7 +125,7 @@ class _BoundBlend(BoundLaw):
         from masiv.kernels.pointwise import PointwiseKernels
 
         self.kernels, self.dt = mpm.attached(PointwiseKernels, lambda: PointwiseKernels(mpm)), dt
-        self.law = BlendedLaw(tabulated(law.first), tabulated(law.second), law.weight)
+        self.law = BlendedLaw(law.first.frozen(), law.second.frozen(), law.weight)
         self.trial = torch.empty(count, 3, 3, dtype=law.first.log_stress_scale.dtype)
 
     def forward(self, s: int, count: int) -> None:

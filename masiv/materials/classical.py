@@ -97,6 +97,9 @@ class ClassicalLaw(Law):
     def coefficients(self, dt: float) -> torch.Tensor:
         """What the kernels take in a substep of dt [s], shape (K,): see the ``c`` of each function in
         ``masiv.kernels.laws``."""
+        return self.once(dt, lambda: self._coefficients(dt))
+
+    def _coefficients(self, dt: float) -> torch.Tensor:
         mu, lam = self.elastic_moduli()
         if self.kind == "neo_hookean":
             return torch.stack([mu, lam])

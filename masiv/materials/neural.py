@@ -30,10 +30,11 @@ if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
 
 STRAIN_SCALE = 0.02
-LOG_MODULUS_RANGE = 6.0
-EVERY = 5
-"""Of the lattice's nodes, every which one ``prior_distance`` looks at: no count of the lattice is a multiple of it."""
-LOG_RATE_RANGE = 14.0  # relaxation rates of e^-14 to e^14 per second
+"""Strain [1] beyond which the elastic features are logarithmic."""
+LOG_MODULUS_RANGE, LOG_RATE_RANGE = 6.0, 14.0
+"""Moduli are e^-6 to e^6 of the stress scale, relaxation rates e^-14 to e^14 per second."""
+PRIOR_STRIDE = 5
+"""``prior_distance`` takes every fifth node of the lattice: no count of the lattice is a multiple of 5."""
 
 
 def strain_invariants(deformation_gradient: torch.Tensor) -> torch.Tensor:
@@ -105,6 +106,9 @@ class NeuralLaw(Law):
 
     def moduli_table(self) -> torch.Tensor:
         """ln g1, ln g2, ln kappa and coupling [Pa] at the nodes of ``masiv.materials.table``, (K, 4)."""
+        return self.once("moduli", self._moduli_table)
+
+    def _moduli_table(self) -> torch.Tensor:
         raw = self.elastic(table.nodes(self.log_stress_scale.dtype))
         shear, bulk = (LOG_MODULUS_RANGE * torch.tanh(part / LOG_MODULUS_RANGE) for part in raw[:, :3].split((2, 1), 1))
         coupling = torch.exp(self.log_stress_scale) * torch.tanh(raw[:, 3:])
@@ -113,6 +117,9 @@ class NeuralLaw(Law):
 
     def rate_table(self) -> torch.Tensor:
         """Logarithms of the isochoric and volumetric relaxation rate [1/s] at the nodes, (K, 2)."""
+        return self.once("rates", self._rate_table)
+
+    def _rate_table(self) -> torch.Tensor:
         raw = self.plastic(table.nodes(self.log_stress_scale.dtype))
         isochoric, volumetric = raw.split(1, dim=1)
         moved = torch.cat([isochoric + self.log_flow_rate, volumetric], dim=1)
@@ -120,7 +127,7 @@ class NeuralLaw(Law):
 
     def flow_table(self, dt: float) -> torch.Tensor:
         """-ln of the shares of isochoric and volumetric strain that a substep of dt [s] keeps, at the nodes, (K, 2)."""
-        return table.lipschitz_envelope(dt * torch.exp(self.rate_table()))
+        return self.once(("flow", dt), lambda: table.lipschitz_envelope(dt * torch.exp(self.rate_table())))
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
         """Coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress`` from invariants (N, 3)."""
@@ -154,7 +161,7 @@ class NeuralLaw(Law):
     def prior_distance(self, other: NeuralLaw) -> torch.Tensor:
         """Mean square difference () of the networks' outputs (log moduli relative to the stress scale, coupling, log
         rates) from those of ``other`` over the lattice of strain features; the scales do not count."""
-        nodes = table.nodes(self.log_stress_scale.dtype)[::EVERY]
+        nodes = table.nodes(self.log_stress_scale.dtype)[::PRIOR_STRIDE]
         with torch.no_grad():
             were = other.elastic(nodes), other.plastic(nodes)
         now = self.elastic(nodes), self.plastic(nodes)

@@ -96,7 +96,7 @@ def _tracks_identity(tracks: Tracks) -> dict[str, Any]:
         "bodies": list(tracks.bodies),
         "runs": [
             f"{run.name}: {run.purpose}, {len(run.times)} frames"
-            + (f" from {run.unsteady:g} s" if run.unsteady else "")
+            + (f" from {run.ignore_after_release:g} s" if run.ignore_after_release else "")
             for run in tracks.runs
         ],
         "up": tracks.up.tolist(),

@@ -58,7 +58,7 @@ class Run:
     or hold_out; rest: frames at rest before the release; at_rest (M, 3): where markers are then (in the first frame
     that shows them, without rest frames), NaN for what was not measured; noise_std (M, 3): standard deviation of each
     axis at rest (None: without two rest frames); release [s]: when the body is let go (None: not known); placement: the
-    body's own axes -> world at rest (None: no geometry); unsteady [s]: how long after the release it is not compared.
+    body's own axes -> world at rest (None: no geometry); ignore_after_release [s]: not compared for this long.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Run:
     noise_std: np.ndarray | None
     release: float | None
     placement: Placement | None
-    unsteady: float = 0.0
+    ignore_after_release: float = 0.0
 
     @property
     def axes(self) -> np.ndarray:
@@ -104,7 +104,9 @@ class Run:
         if the release is not known or too few frames are left.
         """
         if not skip < duration:
-            raise InputError(f"run {self.name}: unsteady: {skip:g} s leaves nothing of tracks.duration {duration:g} s")
+            raise InputError(
+                f"run {self.name}: ignore_after_release: {skip:g} s leaves nothing of tracks.duration {duration:g} s"
+            )
         if self.release is None:
             raise InputError(f"run {self.name}: nobody knows when it was let go: give rest_frames")
         cut, chosen = self.between(self.release + skip, self.release + duration), list(markers)
@@ -166,7 +168,7 @@ class Tracks:
         return {name: tuple(b for b in self.bodies.values() if b.group == name) for name in names}
 
 
-def rest_of(positions: np.ndarray, rest: slice | None) -> tuple[np.ndarray, np.ndarray | None]:
+def rest_positions(positions: np.ndarray, rest: slice | None) -> tuple[np.ndarray, np.ndarray | None]:
     """``at_rest`` and ``noise_std`` of a ``Run`` with positions (T, M, 3) [m]."""
     if rest is None:
         first = np.argmax(np.isfinite(positions), axis=0)

@@ -71,7 +71,7 @@ def _flight(run: Run) -> InitialCondition:
 
 def _release(tracks: Tracks, run: Run, config: TracksConfig) -> InitialCondition:
     free = tracks.bodies[run.body].free_markers(run)
-    _, _, speed = run.released(free, run.unsteady, config.duration)
+    _, _, speed = run.released(free, run.ignore_after_release, config.duration)
     markers = {run.markers[m]: run.at_rest[m] for m in free}
     return InitialCondition(
         run.name, run.body, run.rate, np.zeros(3), np.zeros(3), run.condition, run.placement, Release(markers, speed)
