@@ -134,7 +134,7 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     simulation = only(simulation_of(bar, "load", TRACKS, SIMULATOR, known=known), ("point_mass", "gravity_scale"))
     family = family_of("neo_hookean", 1070, known)
     base = gauss_newton_fit(simulation, Model(family, "none", ("viscosity",)), {}, budget=4)
-    assert simulation.curriculum(base)  # its phase is lost
+    assert simulation.curriculum(base.fields)  # its phase is lost
     result = refine(simulation, [base], settings(shortlist=1))
     after = result.after
     assert after.model.effects == ("viscosity", "point_mass")
@@ -180,12 +180,14 @@ def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
         "tip_deflection": -4e-3,
     }  # fmt: skip
     named = {f"{name}@{run.name}": value for name, value in truth.items()}
-    assert {p.name for p in run.starts} == set(named)
-    seen = simulation.markers(replace(run, fitted=True), model, named)
-    plain = simulation.markers(replace(run, fitted=True), model, dict.fromkeys(named, 0.0))
+    parameters = simulation.release_parameters(run)
+    assert {p.name for p in parameters} == set(named)
+    fitted = replace(run, fit_count=run.time_count)
+    seen = simulation.markers(fitted, model, named)
+    plain = simulation.markers(fitted, model, dict.fromkeys(named, 0.0))
     assert np.abs(seen - plain).max() > 2e-3
-    found, markers = simulation.fit_release(replace(run, observed=seen), model, {})
-    for p, value in zip(run.starts, found, strict=True):
+    found, markers = simulation.fit_release(replace(run, values=seen), model, {})
+    for p, value in zip(parameters, found, strict=True):
         assert value == pytest.approx(named[p.name], abs=0.2 * p.step), p.name
     np.testing.assert_allclose(markers, seen, atol=1e-5)
     # That of a fitted run is found, too, and not among what is fitted.
@@ -206,8 +208,8 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
     base = gauss_newton_fit(
         simulation, Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",)), {}, budget=4
     )
-    assert simulation.is_out_of_phase(base)
-    assert not simulation.curriculum(base)
+    assert simulation.is_out_of_phase(base.fields)
+    assert not simulation.curriculum(base.fields)
     (found,) = score(simulation, base, ["point_mass"], robust_scale=1e-3).candidates
     assert found.finite
     after = fit_with_effect(simulation, base, found, 1e-3)
@@ -218,7 +220,7 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
 
 def test_what_acts_on_the_matter_at_a_place_is_in_the_body(bar):
     simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known={})
-    particles = simulation.observations[0].body.particles.numpy()
+    particles = simulation.body(simulation.observations[0]).particles.numpy()
     for name in ("point_mass", "point_force"):
         for p, low, high in zip(simulation.term(name).others, particles.min(0), particles.max(0), strict=True):
             assert (p.lower, p.upper) == pytest.approx((low, high))

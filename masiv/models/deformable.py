@@ -53,7 +53,7 @@ class DeformableBody:
         for name, shape in (("particles", (len(self.particles), 3)), ("gravity", (3,)), ("normals", (planes, 3))):
             found = tuple(getattr(self, name).shape)
             if found != shape:
-                raise ValueError(f"a body's {name} have shape {found}, they must be {shape}")
+                raise ValueError(f"a body's {name} has shape {found}, it must be {shape}")
 
     @property
     def count(self) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from masiv.scene.scene import Scene
+from masiv.scene.summary import conventions
 from masiv.tracks.tracks import Tracks
 
 DIGITS = 9
@@ -71,19 +72,8 @@ def _scene_identity(scene: Scene) -> dict[str, Any]:
     for view, frame in ((visible[0], 0), (visible[-1], scene.frame_count - 1)):
         pictures.update(scene.frame(view, frame).image.tobytes())
         pictures.update(scene.frame(view, frame).mask.tobytes())
-    ground = None
-    if scene.ground is not None:
-        ground = {"normal": scene.ground.normal.tolist(), "height_m": float(scene.ground.height)}
     return {
-        "layout": scene.layout,
-        "fps": float(scene.fps),
-        "frames": scene.frame_count,
-        "views": len(scene.cameras),
-        "up": scene.up.tolist(),
-        "gravity_m_s2": scene.gravity.tolist(),
-        "ground": ground,
-        "density_kg_m3": float(scene.density),
-        "mask_source": scene.mask_source,
+        **conventions(scene),
         "cameras_sha256": cameras.hexdigest()[:16],
         "pictures_sha256": pictures.hexdigest()[:16],
     }
