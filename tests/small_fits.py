@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from masiv.inference.model_fit import ModelFit
 from masiv.inference.noise_model import NoiseModel
-from masiv.models.base import EffectTerm, WeightedResidual
+from masiv.models.base import EffectTerm, Model
 from masiv.models.families import Family
-from masiv.models.free_body import Model
 from masiv.models.parameters import Parameter
+from masiv.observations.base import Observation
 
 INSTANTS, FITTED, COUNT = 6, 4, 5
 NOISE, SAMPLES = 1e-3, 100
@@ -20,22 +19,14 @@ RATE = Parameter("linear_drag.rate", 0.1, 0.0, 10.0, 0.1)
 DRAG = EffectTerm("linear_drag", "linear_drag", (RATE,), (), ((),), {RATE.name: "1/s"})
 
 
-@dataclass(frozen=True)
-class SmallObservation(WeightedResidual):
-    """Too few points to tell how smooth a noise is."""
-
-    residual_std: np.ndarray
-    noise_std: float = NOISE
-    fit_count: int = FITTED
-    holds_out: bool = True
-    time_count: int = INSTANTS
-    points: np.ndarray = None
-    name: str = "a"
-
-
 def noise_model(residual_std=NOISE, holds_out=True):
-    std = np.full(INSTANTS, residual_std)
-    return NoiseModel([SmallObservation(std, points=np.zeros((COUNT, 3)), holds_out=holds_out)])
+    """Of one observation of too few points to tell how smooth a noise is."""
+    observation = Observation(
+        name="a", times=np.arange(1.0, INSTANTS + 1), points=np.zeros((COUNT, 3)),
+        values=np.zeros((INSTANTS, COUNT, 3)), fit_count=FITTED if holds_out else INSTANTS, noise_std=NOISE,
+        residual_std=np.full(INSTANTS, residual_std),
+    )  # fmt: skip
+    return NoiseModel([observation])
 
 
 def fit_with(fitted, held_out, *, count=3, gain=None, effects=(), z=5.0, law="neo_hookean"):

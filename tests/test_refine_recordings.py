@@ -42,7 +42,8 @@ class Thrown:
     def __init__(self, limit):
         self.limit = limit
         frame = SimulationFrame(np.eye(3), np.zeros(3))
-        self.observations = (SimpleNamespace(name="a", problem=SimpleNamespace(axes=frame, frames=4)),)
+        self.observations = (SimpleNamespace(name="a"),)
+        self.setups = (SimpleNamespace(body=SimpleNamespace(axes=frame, frames=4)),)
 
     def positions(self, model, values, index, frames):
         speed = values.get("velocity_x@a", 0.1)
