@@ -33,8 +33,9 @@ def main():
     from masiv.materials.classical import ClassicalLaw
     from masiv.observations.motion import SampledMotion
     from masiv.refine.config import RefineConfig
-    from masiv.refine.stage import Throw, refine, twin_of
-    from masiv.refine.summary import summary
+    from masiv.refine.document import document as document_of
+    from masiv.refine.from_video import Recording, refine_recordings
+    from masiv.refine.to_twin import refined_twin
 
     runtime.start("cpu")
     torch.set_num_threads(1)
@@ -54,17 +55,17 @@ def main():
         twin = identify(seen, fitted, config, settings.simulator, seed=0, progress=quiet)
         laws[name], errors[name] = twin.law, twin.fit["trajectory_error_mm"]
     wanted = RefineConfig.model_validate({"particles": 800, "laws": [kind]})
-    throw = Throw("drag", scene, fitted, motion, FRAMES)
-    found = refine([throw], config, settings.simulator, wanted, progress=quiet)
-    document = summary(found, wanted, dry_run=False)
+    recording = Recording("drag", scene, fitted, motion, FRAMES)
+    result = refine_recordings([recording], config, settings.simulator, wanted, progress=quiet)
+    document = document_of(result)
     print("refine:", document["verdict"], [(a["effect"], a["theta"], a["stderr"]) for a in document["accepted"]])
-    refined = twin_of(found.result.after, throw, found.simulation, twin)
+    refined = refined_twin(twin, result)
     laws["drag, refine's classical law"] = refined.law
     again = relearn(refined, seen, fitted, config, seed=0, progress=quiet)
     laws["drag, learnt anew beside the effect"] = again.law
     errors["drag, learnt anew beside the effect"] = again.fit["trajectory_error_mm"]
 
-    gradients = gone_through(replace(refined, law=laws["truth"]))
+    gradients = gone_through(refined.with_body(law=laws["truth"]))
     with torch.no_grad():
         over = {name: law.stress(gradients).double().numpy() for name, law in laws.items()}
     curves = {name: stresses(law) for name, law in laws.items()}
@@ -90,9 +91,9 @@ def gone_through(twin):
     """Elastic deformation gradients (M, 3, 3) of all particles at the fitted frames."""
     import torch
 
-    from masiv.simulation.simulate import march
+    from masiv.simulation.free_body import iterate_states
 
-    return torch.cat([state.trial_gradient for state in march(twin, frames=FRAMES, fps=twin.fps)])
+    return torch.cat([state.trial_gradient for state in iterate_states(twin, frames=FRAMES, fps=twin.fps)])
 
 
 def stresses(law):

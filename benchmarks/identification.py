@@ -148,7 +148,7 @@ def truth_of(scene: Path) -> dict[str, Any]:
 def told(folder: Path, scene: Scene, trajectory: Trajectory, simulator: SimulatorConfig) -> Twin:
     """The reconstructed body with the throw, ground and law of truth.yaml."""
     truth = truth_of(folder)
-    return Twin(
+    return Twin.of_body(
         positions=trajectory.positions[0], velocity=np.array(truth["initial_velocity"], float),
         omega=np.array(truth["initial_omega"], float), gravity=scene.gravity, ground=scene.ground,
         contact=truth["floor"]["mode"], friction=0.0, volume=trajectory.volume, density=scene.density, up=scene.up,
@@ -199,11 +199,9 @@ def identifiability_issue(twin: Twin, other: Path, scene: Path) -> dict[str, Any
     initial_motion = estimate_initial_motion(
         trajectory.positions, trajectory.times, read.gravity, read.ground, clearance=spacing
     )
-    rigid_initial_state = dataclasses.replace(
-        twin, positions=trajectory.positions[0], volume=trajectory.volume, velocity=initial_motion.velocity,
-        omega=initial_motion.omega,
-    )  # fmt: skip
-    motion = simulate(rigid_initial_state, frames=read.frame_count, fps=read.fps).positions
+    again = twin.with_body(particles=trajectory.positions[0], volume=trajectory.volume)
+    again = again.with_motion(velocity=initial_motion.velocity, omega=initial_motion.omega)
+    motion = simulate(again, frames=read.frame_count, fps=read.fps).positions
     truth = read_truth(scene / "gt", read.frame_count)
     after = range(initial_motion.last_frame + 1, read.frame_count)
     return {"after contact": motion_numbers(motion, truth, after), "floor": floor(truth)}

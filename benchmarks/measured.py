@@ -31,7 +31,7 @@ MARKERS_AT = {"tip1": [36, 15, 0], "tip2": [24, -6, 0], "tip3": [6, 36, 0],
 BEAM_AT_REST = {("gravity", "a"): [20, 60], ("gravity", "b"): [20, 55],
                 ("load52", "a"): [10, 35], ("load52", "b"): [10, 45]}  # fmt: skip
 """Frames in which the beam is held straight."""
-LOAD_UNSTEADY = 0.1
+LOAD_IGNORED = 0.1
 """How long [s] after the release the loaded tip stops and goes (0.31, 0.18, 0.37 m/s after 28, 48 and 68 ms)."""
 
 
@@ -74,12 +74,12 @@ def write_beam(source: Path, out: Path) -> Path:
     _link(source / "beam.stl", out)
     runs = []
     for kind, condition in (("gravity", ""), ("load52", "load52")):
-        unsteady = {} if not condition else {"unsteady": LOAD_UNSTEADY}
+        ignored = {} if not condition else {"ignore_after_release": LOAD_IGNORED}
         for repeat, use in (("a", "fit"), ("b", "hold_out")):
             name = f"beam_{kind}_V2_{repeat}.csv"
             _link(source / name, out)
             runs.append({"file": name, "name": f"{kind}_{repeat}", "condition": condition, "use": use,
-                         "rest_frames": BEAM_AT_REST[kind, repeat], **unsteady})  # fmt: skip
+                         "rest_frames": BEAM_AT_REST[kind, repeat], **ignored})  # fmt: skip
     body = {
         "density": 1070,
         "poissons_ratio": 0.499,
@@ -112,13 +112,14 @@ def balls(source: Path) -> dict:
     from masiv.inference.model_fit import gauss_newton_fit
     from masiv.models.free_body import Model
     from masiv.refine.config import RefineConfig
-    from masiv.refine.pooling import refine_group, unlike
+    from masiv.refine.from_tracks import refine_group
+    from masiv.refine.search_state import SearchSettings
 
     tracks = ball_scene(source)
     began = time.perf_counter()
-    found = refine_group(tracks, "balls", RefineConfig.model_validate({}))
+    refined = refine_group(tracks, "balls", SearchSettings.of(RefineConfig.model_validate({})))
     seconds = time.perf_counter() - began
-    simulation, result = found.simulation, found.result
+    simulation, result = refined.forward_model, refined.search
     first = {t.candidate.effect: t for t in result.rounds[0].trials}
     alike = simulation.by_body
     rows = {
@@ -139,13 +140,14 @@ def balls(source: Path) -> dict:
         for t in terms
     }  # fmt: skip
     return {
-        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows, "refused": found.refused,
+        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows,
+        "refused": {n: b.objections for n, b in refined.bodies.items() if b.objections},
         "shared": [
-            {"bodies": s.bodies,
-             "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.effect)},
-             "spread": unlike(s, result, simulation), "information_gain": s.gain,
+            {"bodies": s.term.bodies,
+             "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.term.effect)},
+             "spread": s.strength_std, "information_gain": s.bic_gain,
              "held_out_mm": alike(s.fitted.model, s.fitted.values, fitted=False)}
-            for s in found.shared
+            for s in refined.shared
         ],
         "gravity_each": [9.8 * (1 + trap.values[p.name]) for p in each.parameters],
         "information_gain_of_gravity_each": result.before.bic(trap.samples) - trap.bic(trap.samples),

@@ -38,40 +38,41 @@ def measured(run, truth_file, second, given):
 
     from masiv.config import RefineConfig
     from masiv.pipeline import reopen_run
-    from masiv.pipeline.refine_video import load_identified_twin, recording_of
-    from masiv.refine.stage import refine
-    from masiv.refine.summary import summary
+    from masiv.pipeline.refine_video import recording_of
+    from masiv.refine.document import document as document_of
+    from masiv.refine.from_video import refine_recordings
+    from masiv.twin.identified import load_identified
 
     truth = yaml.safe_load(truth_file.read_text())
-    throws, began = [], time.time()
+    recordings, began = [], time.time()
     for path in [run, *second]:
         opened = reopen_run(path)
-        if not throws:
+        if not recordings:
             opened.start()
             first = opened.config
-        throws.append(recording_of(opened, quiet))
-    twin = load_identified_twin(run)
+        recordings.append(recording_of(opened, quiet))
+    twin = load_identified(run)
     config = RefineConfig.model_validate({**first.refine.model_dump(), **given})
     start = twin.fit.get("start") or twin.fit.get("law")
     loaded = time.time()
-    found = refine(throws, first.identify, first.simulator, config, start=start, progress=quiet)
+    result = refine_recordings(recordings, first.identify, first.simulator, config, start=start, progress=quiet)
     done = time.time()
-    document = summary(found, config, dry_run=False)
+    document = document_of(result)
     effects = true_effects(truth)
     told = None
     law = FAMILIES[truth["material"]["type"]]
     known = {PARAMETERS[k]: float(v) for k, v in truth["material"].items() if k in PARAMETERS}
     if effects:
-        contact = found.result.after.model.contact
-        told = oracle(found.simulation, found.result, law=law, contact=contact, parameters=known, effects=effects)
-    keep = ("verdict", "candidates", "accepted", "before", "after", "residual_over_floor", "rounds", "laws")
+        contact = result.after.model.contact
+        told = oracle(result.forward_model, result.search, law=law, contact=contact, parameters=known, effects=effects)
+    keep = ("verdict", "candidates", "accepted", "before", "after", "reduced_chi", "rounds", "laws")
     return {
         "run": run.name,
         "second": [p.name for p in second],
         "true": effects,
         "document": {k: document[k] for k in keep if k in document},
         "oracle": told,
-        "rollouts": found.simulation.rollouts,
+        "rollouts": result.forward_model.rollouts,
         "seconds": [loaded - began, done - loaded],
     }
 

@@ -98,7 +98,8 @@ def reset_initial_conditions(case, config):
     from masiv.models.prepare import video_observation
     from masiv.mpm.config import SimulatorConfig
     from masiv.observations.motion import SampledMotion
-    from masiv.refine.baselines import baselines
+    from masiv.refine.baselines import BaselineProblem, baselines
+    from masiv.workers import Workers
 
     torch.set_num_threads(1)
     scene, motion = observed(case)
@@ -108,60 +109,61 @@ def reset_initial_conditions(case, config):
         "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
     )
     simulation = Simulation([observation])
-    fits = baselines(
-        simulation, coarse, coarser, min(initial_motion.last_frame + 2, coarse.frames), config, Checkpoint(None), quiet
-    )
+    problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.frames))
+    fits = baselines(simulation, problem, config, Checkpoint(None), quiet, Workers())
     return simulation, observation, fits
 
 
 def told_of(case, config):
-    """Error of a model that was told, weighed as refine weighs what it has found: as that model moves."""
+    """Error of a model that was told, whitened as refine whitens its result: as that model moves."""
     from oracle import told
 
+    from masiv.inference.discretization import with_residual_std
     from masiv.models.free_body import Simulation
-    from masiv.refine.search import update_residual_std
 
     began = time.time()
     simulation, _, fits = reset_initial_conditions(case, config)
     observation_std = [e.residual_std for e in simulation.observations]
     best = min(fits, key=lambda f: f.cost)
-    update_residual_std(simulation, best, observation_std)
+    simulation = with_residual_std(simulation, best, observation_std)
     own = Simulation(simulation.observations)  # with substeps that the true stiffness asks for
     best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
-    update_residual_std(own, best, observation_std)
+    own = with_residual_std(own, best, observation_std)
     best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
     return {"case": case.name, "oracle": [best.fit_mm, best.held_out_mm], "seconds": [time.time() - began]}
 
 
 def refined(case, config):
-    from masiv.refine.evidence import reduced_chi
-    from masiv.refine.rounds import like_accepted
-    from masiv.refine.search import search_effects
-    from masiv.refine.stage import Refined
-    from masiv.refine.summary import verdict
+    from masiv.refine.rounds import similar_to_accepted
+    from masiv.refine.search_state import SearchSettings
+    from masiv.refine.stage import refine
 
     began = time.time()
     simulation, observation, fits = reset_initial_conditions(case, config)
     middle = time.time()
-    result = search_effects(simulation, fits, config, quiet)
+    refined = refine(simulation, fits, SearchSettings.of(config))
     end = time.time()
+    result, force = refined.search, refined.search.discrepancy
     first = result.rounds[0] if result.rounds else None
+    accepted = result.after.model.effects
     return {
         "case": case.name,
         "true": {**case.effects, **case.outside},
-        "verdict": verdict(Refined(result, simulation, [], [], None), config),
-        "gap": None if result.gap is None else [result.gap.fit_mm, result.gap.held_out_mm],
+        "verdict": refined.verdict,
+        "discrepancy_force": None if force is None else [force.fit_mm, force.held_out_mm],
         "laws": [f.model.family.kind for f in fits],
         "noise_mm": 1e3 * observation.noise_std,
-        "excess": [reduced_chi(fit, simulation.observations) for fit in (result.before, result.after)],
-        "sigma_mm": (1e3 * simulation.observations[0].residual_std).round(1).tolist(),
+        "reduced_chi": [refined.reduced_chi(fit) for fit in (result.before, result.after)],
+        "residual_std_mm": (1e3 * refined.observations[0].residual_std).round(1).tolist(),
         "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
         "trials": [
-            (t.fitted.model.family.kind, t.candidate.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.reasons)
+            (t.law, t.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.objections)
             for r in result.rounds for t in r.trials
         ],
-        "accepted": list(result.after.model.effects),
-        "or_else": {name: like_accepted(name, result.rounds)["or_else"] for name in result.after.model.effects},
+        "accepted": list(accepted),
+        "indistinguishable_from": {
+            name: similar_to_accepted(name, result.rounds)["indistinguishable_from"] for name in accepted
+        },
         "law": result.after.model.family.kind,
         "values": result.after.values,
         "stderr": result.after.stderr,
@@ -190,7 +192,7 @@ def table(path, oracles):
     print("|---|---|---|---|---|---|---|---|")
     for r in rows:
         counts[judged(r)] += 1
-        others = ", ".join(other for names in r["or_else"].values() for other in names)
+        others = ", ".join(other for names in r["indistinguishable_from"].values() for other in names)
         show = [" / ".join(f"{v:.1f}" for v in pair) if pair else "–"
                 for pair in (r["before"], r["after"], told.get(r["case"]))]  # fmt: skip
         ranked = f"{r['ranked'][0][0]} {r['ranked'][0][1]}" if r["ranked"] else "–"
@@ -203,7 +205,7 @@ def judged(row):
     """What the answer is worth: a control that is left alone is named, too, and so is an effect of no library that is
     called unexplained."""
     true, found = set(row["true"]), set(row["accepted"])
-    others = {other for names in row["or_else"].values() for other in names}
+    others = {other for names in row["indistinguishable_from"].values() for other in names}
     if found == true or (row["verdict"] == "unexplained residual" and not true <= STRENGTHS.keys()):
         return "named, with others beside it" if others else "named"
     if not found:

@@ -8,9 +8,9 @@ import torch
 
 from masiv import runtime
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
-from masiv.simulation.simulate import rigid_initial_state
 
 STEPS, SUBSTEP, SPACING = 400, 2e-4, 0.04
 

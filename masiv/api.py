@@ -28,7 +28,8 @@ from masiv.progress import Progress, silent
 if TYPE_CHECKING:
     from masiv.continuum.trajectory import Trajectory
     from masiv.scene.scene import Scene
-    from masiv.simulation.simulate import Rollout
+    from masiv.simulation.force import ForcePulse
+    from masiv.simulation.rollout import Rollout
     from masiv.splat.dynamic import DynamicGaussians
     from masiv.twin import Twin
 
@@ -87,15 +88,19 @@ def simulate(
     velocity: Sequence[float] | np.ndarray | None = None,
     omega: Sequence[float] | np.ndarray | None = None,
     gravity: Sequence[float] | np.ndarray | None = None,
+    force: ForcePulse | None = None,
     without: Sequence[str] = (),
+    condition: str | None = None,
     arch: str = "cpu",
     progress: Progress = silent,
 ) -> Rollout:
-    """The first ``frames`` frames of the twin's motion: ``positions`` (frames, Q, 3) float32 [m].
+    """The first ``frames`` frames of the twin's motion: ``positions`` (frames, Q, 3) float32 [m], and markers of bodies
+    that have any.
 
-    velocity (3,) [m/s] of the centroid, omega (3,) [rad/s], gravity (3,) [m/s^2]: as identified if None. without: names
-    of effects that are left out. Raises InputError for a vector of another shape or an effect that the twin does not
-    have, NonFiniteError if the motion diverges.
+    velocity (3,) [m/s] of the centroid, omega (3,) [rad/s], gravity (3,) [m/s^2]: as identified if None. force: on the
+    whole body for a while. without: names of effects that are left out. condition: of the runs whose start and effects
+    are simulated (None: the first). Raises InputError for a vector of another shape, for an effect or a condition that
+    the twin does not have and for what its bodies cannot have; NonFiniteError if the motion diverges.
     """
     from masiv.simulation.simulate import simulate as stage
 
@@ -107,7 +112,9 @@ def simulate(
         velocity=_vector("velocity", velocity),
         omega=_vector("omega", omega),
         gravity=_vector("gravity", gravity),
+        force=force,
         without=tuple(without),
+        condition=condition,
         progress=progress,
     )
 

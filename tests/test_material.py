@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from masiv.characterization import curves
-from masiv.characterization.describe import Quantity, describe, describe_twin, paragraph, said
+from masiv.characterization.describe import Quantity, describe, describe_twin, formatted, paragraph
 from masiv.characterization.excitation import Excited, excited_range, perturbed, sensitivities
 from masiv.errors import InputError, NonFiniteError
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.mpm.rollout import at_rest
 from masiv.pretraining.pretrain import MATERIALS, pretrained_path
-from masiv.report.material import material_section, read_material
 from masiv.report.page import Page
+from masiv.report.sections.material import material_section, read_material
 
 SEEN = Excited((0.0005, 0.03), (0.001, 0.3), (-0.01, 0.005), 5.0)
 
@@ -82,26 +82,28 @@ def test_relaxation_time_of_a_maxwell_body():
     assert curves.relaxation_time(classical("jelly"), 0.1) is None
 
 
-def test_a_tabulated_law_is_the_law():
+def test_a_frozen_law_is_the_law():
     law = pretrained("plasticine").double()
     f = torch.eye(3).double() + 0.1 * torch.randn(20, 3, 3, generator=torch.Generator().manual_seed(1)).double()
-    known = curves.tabulated(law)
+    known = law.frozen()
     torch.testing.assert_close(known.project(f, 1e-3), law.project(f, 1e-3).detach(), rtol=0, atol=0)
     torch.testing.assert_close(known.stress(f), law.stress(f).detach(), rtol=0, atol=0)
 
 
-def test_an_exact_classical_law_finds_its_coefficients_once_a_step(monkeypatch):
-    asked, coefficients = [], ClassicalLaw.coefficients
-
-    def counted(law, dt):
-        asked.append(dt)
-        return coefficients(law, dt)
-
-    monkeypatch.setattr(ClassicalLaw, "coefficients", counted)
-    law = curves.exact(ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=1e3))
+def test_a_frozen_law_computes_its_tables_and_coefficients_once():
+    law = curves.in_float64(ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=1e3))
+    assert law.coefficients(1e-3) is law.coefficients(1e-3)
+    assert law.coefficients(1e-3) is not law.coefficients(1e-4)
+    neural = pretrained("plasticine")
+    assert neural.flow_table(1e-3) is not neural.flow_table(1e-3)  # its parameters may change
+    frozen = neural.frozen()
+    assert frozen.moduli_table() is frozen.moduli_table()
+    assert frozen.flow_table(1e-3) is frozen.flow_table(1e-3)
+    for k in range(100):  # what is remembered is bounded
+        frozen.flow_table(1e-3 + 1e-5 * k)
+    assert len(frozen._known) <= 16
     path = curves.simple_shear(np.linspace(0, 0.2, 5))[:, None]
     slow, quick = (curves.drive(law, path, dt)[1] for dt in (1e-3, 1e-4))
-    assert asked == [1e-3, 1e-4]
     torch.testing.assert_close(slow, quick, rtol=0, atol=0)  # its yield knows no rate
 
 
@@ -261,7 +263,7 @@ def test_a_twin_is_described_with_errors_saved_and_reported(taichi, tmp_path):
 
 
 def test_quantities_are_said_with_fitting_units():
-    assert said(Quantity(12345.0, "Pa", stderr_percent=14.2)) == "12.3 kPa ± 14 %"
-    assert said(Quantity(2e6, "Pa", "under pressure")) == "2 MPa (under pressure)"
-    assert said(Quantity(None, "Pa")) == "none"
-    assert said(Quantity(0.3, "", stderr_percent=250.0)) == "0.3 ± more than 100 %"
+    assert formatted(Quantity(12345.0, "Pa", stderr_percent=14.2)) == "12.3 kPa ± 14 %"
+    assert formatted(Quantity(2e6, "Pa", "under pressure")) == "2 MPa (under pressure)"
+    assert formatted(Quantity(None, "Pa")) == "none"
+    assert formatted(Quantity(0.3, "", stderr_percent=250.0)) == "0.3 ± more than 100 %"

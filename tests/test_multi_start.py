@@ -1,6 +1,7 @@
 """Two starts that few particles cannot distinguish: both are fitted, the better fit is kept."""
 
 import pytest
+from small import SMALL
 from test_identify import body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.checkpoint import Checkpoint
@@ -13,7 +14,6 @@ from masiv.identify.recording import FitRecording
 from masiv.materials.neural import NeuralLaw
 from masiv.models.initial_state import InitialState
 from masiv.models.problem import Problem
-from masiv.mpm.config import SimulatorConfig
 from masiv.progress import silent
 
 
@@ -22,7 +22,7 @@ def fit(seen, monkeypatch, errors, objectives, image_losses=None):  # noqa: F811
     diverges; image_losses: after the surface finetune of each, None without such a finetune."""
     fitted, laws = [], {name: NeuralLaw(seed=k) for k, name in enumerate(errors)}
     changes = {"surface_finetune": image_losses is not None, "pictures": 1}
-    problem = Problem(scene(), seen[0], settings(**changes), SimulatorConfig())
+    problem = Problem(scene(), seen[0], settings(**changes), SMALL)
     objective = Objective(problem)
     monkeypatch.setattr(Objective, "has_surface_finetune", image_losses is not None)
 

@@ -45,7 +45,7 @@ def colored_scene(*, plain=False, shade=False):
         image = np.where(picture.mask[..., None] > 0, colour + noise, 0.2)
         return dataclasses.replace(picture, image=np.round(255 * image.clip(0, 1)).astype(np.uint8))
 
-    return dataclasses.replace(scene, load=load, _cache={})
+    return dataclasses.replace(scene, load=load)
 
 
 def errors(terms, angles):

@@ -7,11 +7,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from small import SMALL
 
 SPEC = {
     "shape": {"kind": "cube", "size": 0.4, "rotation_deg": [20, 30, 0], "clearance": 0.25},
@@ -22,6 +23,7 @@ SPEC = {
     "truth_particles": 500,
 }
 TINY = {
+    "simulator": SMALL.model_dump(exclude_defaults=True),
     "reconstruct": {"gaussians": 250, "hull_resolution": 24, "iterations": 120, "width": 16, "depth": 1},
     "trajectory": {"particle_count": 300, "fill_resolution": 24, "iterations": 20},
     "identify": {"start": "jelly", "contact": "sticky", "search_particles": 150, "iterations": 4},
@@ -63,25 +65,52 @@ def whole(folder):
     return folder / "whole"
 
 
-def killed_in(stage, folder, name):
-    """Start the command and kill it, as a power cut would, once ``stage`` is at work."""
-    process = subprocess.Popen(
-        masiv(*identify(folder, name)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
-    state = folder / name / "run.yaml"
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and process.poll() is None:
-        if state.exists() and yaml.safe_load(state.read_text())["stages"][stage]["state"] == "running":
-            break
-        time.sleep(0.05)
-    assert process.poll() is None, "the command ended before it could be killed"
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import yaml
+
+folder, stage = Path(sys.argv.pop(1)), sys.argv.pop(1)
+record, busy = folder / "run.yaml", [False]
+
+def kill(event, arguments):
+    if event != "open" or busy[0] or not isinstance(arguments[0], (str, Path)):
+        return
+    path, writes = Path(arguments[0]), arguments[2] & (os.O_WRONLY | os.O_RDWR)
+    if not (writes and folder in path.parents and record.exists()):
+        return
+    busy[0] = True  # reading opens a file, too
+    if yaml.safe_load(record.read_text())["stages"][stage]["state"] == "running":
+        os.kill(os.getpid(), signal.SIGKILL)
+    busy[0] = False
+
+sys.addaudithook(kill)
+from masiv.cli.main import run
+run()
+"""
 
 
+def killed_in(stage, run, arguments):
+    """Run the command, and kill it as a power cut would when ``stage`` writes its first file to the folder ``run``."""
+    command = [sys.executable, "-c", KILLED, run, stage, *arguments]
+    ended = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+
+
+def test_killed_fit_of_tracks_ends_with_the_numbers_of_a_whole_one(tmp_path):
+    scene = Path(__file__).parent / "golden/balls"
+    whole, broken = (("identify", scene, "--out", tmp_path / name) for name in ("whole", "broken"))
+    done(*whole)
+    killed_in("identify", tmp_path / "broken", broken)
+    assert not (tmp_path / "broken/twin.yaml").exists()
+    done(*broken)
+    assert (tmp_path / "whole/twin.yaml").read_bytes() == (tmp_path / "broken/twin.yaml").read_bytes()
+
+
+@pytest.mark.slow
 def test_killed_run_ends_with_the_numbers_of_a_whole_one(folder, whole):
-    killed_in("reconstruct", folder, "broken")
-    killed_in("identify", folder, "broken")
+    killed_in("reconstruct", folder / "broken", identify(folder, "broken"))
+    killed_in("identify", folder / "broken", identify(folder, "broken"))
     done(*identify(folder, "broken"))
     for name in ("trajectory.npz", "rollout.npz"):
         first, second = (np.load(path / name)["positions"] for path in (whole, folder / "broken"))
@@ -95,6 +124,7 @@ def test_killed_run_ends_with_the_numbers_of_a_whole_one(folder, whole):
     assert rollout["positions"].dtype == np.float32
 
 
+@pytest.mark.slow
 def test_a_run_whose_material_is_missing_makes_it_again_and_nothing_else(folder, whole):
     shutil.copytree(whole, folder / "again")
     (folder / "again/material.json").unlink()
@@ -103,6 +133,7 @@ def test_a_run_whose_material_is_missing_makes_it_again_and_nothing_else(folder,
         assert (folder / "again" / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_evaluate_separates_observed_from_future(folder, whole):
     numbers = done("evaluate", whole, "--truth", folder / "gt")
     twin = numbers["motion"]["twin"]
@@ -113,6 +144,7 @@ def test_evaluate_separates_observed_from_future(folder, whole):
     assert twin["future"]["tracked_error_mm"] < rigid["future"]["tracked_error_mm"]
 
 
+@pytest.mark.slow
 def test_simulate_starts_from_the_identified_motion(folder, whole):
     done("simulate", whole, "--frames", 3, "--out", folder / "same")
     as_filmed, again = (np.load(path / "rollout.npz")["positions"] for path in (whole, folder / "same"))

@@ -1,13 +1,14 @@
 """The rasteriser against its plain-torch twin, finite differences and pictures whose answer is known."""
 
 import dataclasses
+import doctest
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from masiv.errors import MasivError
+from masiv.errors import InputError, MasivError
 from masiv.scene.camera import Camera
 from masiv.splat._reference import _render
 from masiv.splat.rasteriser import render
@@ -176,3 +177,29 @@ def test_non_finite_is_an_error():
     gaussians[0][1, 2] = float("nan")
     with pytest.raises(MasivError, match="not finite"):
         render(make_camera(), *gaussians, BACKGROUND)
+
+
+@pytest.mark.parametrize(
+    ("which", "change", "message"),
+    [
+        (0, lambda t: t[:, :2], r"means has shape \(60, 2\), it must be \(60, 3\)"),
+        (1, lambda t: t[:, None].expand(-1, 3), r"scales has shape \(60, 3\), it must be \(60,\)"),
+        (2, lambda t: t[:-1], r"opacities has shape \(59,\), it must be \(60,\)"),
+        (3, lambda t: t[:, 0], r"colours has shape \(60,\), it must be \(60, 3\)"),
+        (4, lambda t: t[:2], r"background has shape \(2,\), it must be \(3,\)"),
+        (1, lambda t: t.float(), "scales is torch.float32 and means torch.float64"),
+        (0, lambda t: t.long(), "means is torch.int64"),
+    ],
+)
+def test_a_wrong_shape_or_type_is_named(which, change, message):
+    given = [*make_gaussians(), BACKGROUND]
+    given[which] = change(given[which])
+    with pytest.raises(InputError, match=message):
+        render(make_camera(), *given)
+
+
+def test_the_example_in_the_docstring_runs():
+    (example,) = (test for test in doctest.DocTestFinder().find(render, "render") if test.examples)
+    result = doctest.DocTestRunner().run(example)
+    assert result.failed == 0
+    assert result.attempted >= 9

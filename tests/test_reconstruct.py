@@ -265,7 +265,7 @@ def test_only_what_may_be_seen_is_read(scene):
         asked.add((view, frame))
         return scene.load(view, frame)
 
-    part = dataclasses.replace(scene, load=load, _cache={}).restricted(fit_frames=2, holdout_cameras=(0, 5))
+    part = dataclasses.replace(scene, load=load).restricted(fit_frames=2, holdout_cameras=(0, 5))
     reconstruct(part, CONFIG.model_copy(update={"iterations": 4}), seed=0, checkpoint=Checkpoint(None), progress=silent)
     assert asked == {(view, frame) for view in (1, 2, 3, 4, 6) for frame in (0, 1)}
 
@@ -275,7 +275,7 @@ def test_a_frame_without_the_object_is_named(scene):
         picture = scene.load(view, frame)
         return dataclasses.replace(picture, mask=picture.mask * (frame != 2))
 
-    empty = dataclasses.replace(scene, load=load, _cache={})
+    empty = dataclasses.replace(scene, load=load)
     with pytest.raises(MasivError, match=r"frame 2 of ball"):
         reconstruct(empty, CONFIG, seed=0, checkpoint=Checkpoint(None), progress=silent)
 
@@ -319,7 +319,7 @@ def test_occluded_pixels_neither_count_nor_darken(scene):
         image = np.where(valid[..., None], picture.image, 0).astype(np.uint8)
         return Frame(image, picture.mask, valid)
 
-    hidden = observed_image(dataclasses.replace(scene, load=load, _cache={}), 1, 0, crop_side=16, crop_padding=3)
+    hidden = observed_image(dataclasses.replace(scene, load=load), 1, 0, crop_side=16, crop_padding=3)
     open_ = observed_image(scene, 1, 0, crop_side=16, crop_padding=3)
     inside = (open_.mask > 0.999) & (hidden.valid > 0)
     assert hidden.valid.max() < 0.8

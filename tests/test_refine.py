@@ -8,24 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small import NODES, SMALL, SUBSTEPS
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.effects.context import EffectContext
 from masiv.errors import InputError
 from masiv.identify.config import IdentifyConfig
-from masiv.inference.model_fit import clipped_step
+from masiv.inference.least_squares import clipped_step
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.initial_state import rigid_initial_state
 from masiv.models.parameters import Parameter
-from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
 from masiv.observations.noise_floor import noise_floor
 from masiv.refine.config import RefineConfig
-from masiv.refine.stage import Throw, refine, split_frames
-from masiv.refine.summary import summary
+from masiv.refine.document import document as document_of
+from masiv.refine.from_video import Recording, refine_recordings, split_frames
 from masiv.scene.scene import Ground, Scene
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -52,7 +52,8 @@ def observed(effects, noise_m=3e-4, velocity=VELOCITY, omega=OMEGA):
     start = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.0, 0.45, 0.0])
     steps = 48
     simulator = Simulator(particle_count=COUNT, spacing=(6 * SIDE**3 / COUNT) ** (1 / 3), substep=1 / (FPS * steps),
-                          volume=SIDE**3, density=1000.0, gravity=(0.0, -9.8, 0.0), max_substeps=512)  # fmt: skip
+                          volume=SIDE**3, density=1000.0, gravity=(0.0, -9.8, 0.0),
+                          max_substeps=SUBSTEPS, grid_nodes=NODES)  # fmt: skip
     setting = EffectContext(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * SIDE**3 / COUNT, SIDE, FRAMES / FPS)
     members = tuple((effect_named(name), torch.tensor(values)) for name, values in effects.items())
     law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
@@ -71,15 +72,13 @@ def found(*motions, **settings):
         {"particles": COUNT, "laws": ["neo_hookean"], "shortlist": 3, "samples_per_frame": 1, "max_effects": 2}
         | settings
     )
-    throws = [
-        Throw(f"run{k}" if k else "run", scene(),
+    recordings = [
+        Recording(f"run{k}" if k else "run", scene(),
               SampledMotion(m.positions[:FITTED], m.times[:FITTED], m.volume), m, FITTED)
         for k, m in enumerate(motions)
     ]  # fmt: skip
-    refined = refine(
-        throws, IdentifyConfig.model_validate({"contact": "sticky"}), SimulatorConfig.model_validate({}), config
-    )
-    return refined, summary(refined, config, dry_run=False)
+    refined = refine_recordings(recordings, IdentifyConfig.model_validate({"contact": "sticky"}), SMALL, config)
+    return refined, document_of(refined)
 
 
 @pytest.mark.slow
@@ -92,11 +91,11 @@ def test_undeclared_drag_is_named_measured_and_confirmed():
         document["after"]["held_out"]["trajectory_rmse_mm"] < document["before"]["held_out"]["trajectory_rmse_mm"] / 3
     )
     assert document["candidates"][0]["explained"] > 0.5
-    assert refined.result.after.values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
+    assert refined.after.values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
 
 
 @pytest.mark.slow
-def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
+def test_two_recordings_share_law_and_effect_and_keep_their_own_initial_state():
     other = observed({"body_force": [0.0, 0.0, 2.0]}, velocity=(-0.5, 1.0, 1.0), omega=(0.0, -2.0, 1.0))
     refined, document = found(
         observed({"body_force": [0.0, 0.0, 2.0]}),
@@ -107,16 +106,16 @@ def test_two_throws_share_the_law_and_the_effect_and_keep_their_own_launch():
     )
     assert [a["effect"] for a in document["accepted"]] == ["body_force"]
     assert list(document["accepted"][0]["theta"].values()) == pytest.approx([0, 0, 2], abs=0.1)
-    values = refined.result.after.values
+    values = refined.after.values
     assert values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
     assert values["velocity_x@run1"] == pytest.approx(-0.5, abs=0.05)
-    assert len(refined.after) == 2
+    assert len(refined.after.fields) == 2
     with pytest.raises(InputError, match="unknown effect 'ether'"):
         found(other, effects=["ether"])
 
 
 @pytest.mark.slow
-def test_a_second_cause_is_seen_beside_one_that_took_it_over():
+def test_a_second_effect_is_seen_in_addition_to_one_that_took_it_over():
     pair = {"body_force": [1.5, 0.0, -1.0], "linear_drag": [0.7]}
     _, document = found(
         observed(pair, noise_m=3e-3), effects=["body_force", "linear_drag"], shortlist=2, baseline_rollouts=24

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from masiv.inference.model_fit import gauss_newton_fit, robust_cost
+from masiv.inference.model_fit import gauss_newton_fit
+from masiv.inference.robust import soft_l1_mean_square
 from masiv.models.base import EffectTerm, WeightedResidual
 from masiv.models.free_body import Model
 from masiv.models.parameters import Parameter
-from masiv.refine.add_effect import refit
 from masiv.refine.candidates import score
+from masiv.refine.effect_fit import fit_with_effect
 
 TIMES = np.linspace(0, 0.6, 60)
 BARE, LOAD = 7.7, 2.2
@@ -81,20 +82,20 @@ def test_out_of_phase_a_cause_is_ranked_by_what_it_does_at_finite_strength():
     simulation = Swing(out_of_phase=True)
     base = base_of(simulation)
     assert base.parameters == ()  # nothing to fit is a fit, too
-    first, second = score(simulation, base, robust_scale=1.0)
+    first, second = score(simulation, base, ["mass", "push"], robust_scale=1.0).candidates
     assert (first.effect, second.effect) == ("mass", "push")
     tried = {**base.values, **first.theta}
-    assert 1 - first.explained == pytest.approx(robust_cost(simulation.residual(None, tried), 1.0) / base.cost)
-    assert 1.0 in {c.theta["mass.place"] for c in (first, *first.rivals)}
-    fitted = refit(simulation, base, first, 1.0)
+    assert 1 - first.explained == pytest.approx(soft_l1_mean_square(simulation.residual(None, tried), 1.0) / base.cost)
+    assert 1.0 in {c.theta["mass.place"] for c in (first, *first.alternatives)}
+    fitted = fit_with_effect(simulation, base, first, 1.0)
     assert fitted.values["mass.place"] == 1.0
     assert fitted.values["mass.mass"] == pytest.approx(LOAD, rel=0.02)
     assert fitted.fit_mm < 0.05 * base.fit_mm
     # From none, on the derivative there, it is not found.
     linear = Swing(out_of_phase=False)
-    about_none = next(c for c in score(linear, base, robust_scale=1.0) if c.effect == "mass")
-    assert refit(linear, base, about_none, 1.0).fit_mm > 4 * fitted.fit_mm
-    assert refit(simulation, base, second, 1.0).fit_mm > 4 * fitted.fit_mm
+    about_none = next(c for c in score(linear, base, ["mass"], robust_scale=1.0).candidates if c.effect == "mass")
+    assert fit_with_effect(linear, base, about_none, 1.0).fit_mm > 4 * fitted.fit_mm
+    assert fit_with_effect(simulation, base, second, 1.0).fit_mm > 4 * fitted.fit_mm
 
 
 class Saturating(Swing):
@@ -119,10 +120,10 @@ class Saturating(Swing):
 def test_a_cause_that_falls_short_of_its_promise_is_begun_elsewhere():
     simulation = Saturating()
     base = base_of(simulation)
-    (found,) = score(simulation, base, robust_scale=1.0, names=["mass"])
+    (found,) = score(simulation, base, ["mass"], robust_scale=1.0).candidates
     assert found.theta["mass.place"] == 0.0
-    assert [c.theta["mass.place"] for c in found.rivals] == [1.0]
-    fitted = refit(simulation, base, found, 1.0)
+    assert [c.theta["mass.place"] for c in found.alternatives] == [1.0]
+    fitted = fit_with_effect(simulation, base, found, 1.0)
     assert fitted.values["mass.place"] == pytest.approx(1.0)
     assert fitted.cost < 0.1 * base.cost
 
@@ -136,8 +137,8 @@ def test_what_the_base_left_at_a_guess_stays_there_beside_a_further_cause(out_of
     base = gauss_newton_fit(
         simulation, model, {"mass.mass": LOAD, "mass.place": 1.0}, budget=8, robust_scale=1.0, held=held
     )
-    (push,) = score(simulation, base, robust_scale=1.0, names=["push"])
-    fitted = refit(simulation, base, push, 1.0)
+    (push,) = score(simulation, base, ["push"], robust_scale=1.0).candidates
+    fitted = fit_with_effect(simulation, base, push, 1.0)
     assert fitted.values["mass.place"] == 1.0
     assert {p.name for p in fitted.parameters} == {"mass.mass", "push.x", "push.y"}
     assert fitted.values["push.x"] == pytest.approx(3.0, rel=0.05)

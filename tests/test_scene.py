@@ -256,7 +256,7 @@ def test_held_out_views_and_frames_cannot_be_seen(folder):
     assert scene.views == (0,)
     scene.frame(0, 1)
     for view, frame in ((1, 0), (0, 2)):
-        with pytest.raises(InputError, match="outside"):
+        with pytest.raises(InputError, match="held out"):
             scene.frame(view, frame)
 
 

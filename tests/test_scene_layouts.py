@@ -217,7 +217,7 @@ BAD_TRANSFORMS = [
     (lambda d: d.update(camera_model="OPENCV_FISHEYE"), r"transforms\.json, frame 0: camera_model is 'OPENCV_FISHEYE'"),
     (lambda d: d.update(is_fisheye=True), "camera_model is 'fisheye'"),
     (lambda d: d.update(camera_model="OPENCV", k4=0.1), "has no k4"),
-    (lambda d: d.update(camera_model="OPENCV", k1=-3.0), "folds the picture"),
+    (lambda d: d.update(camera_model="OPENCV", k1=-3.0), "is not invertible in the picture"),
     (lambda d: d.update(fl_x=-5), "must be positive"),
     (lambda d: d.pop("fl_x"), "neither 'fl_x' nor 'camera_angle_x'"),
     (lambda d: d.update(w=400), "another shape"),
@@ -292,5 +292,5 @@ def test_bad_real_captures(tmp_path):
 def test_unknown_layout_lists_the_known_ones(tmp_path):
     with pytest.raises(InputError) as error:
         read_scene(tmp_path)
-    for name, reader in LAYOUTS.items():
-        assert f"{reader.LOOKED_FOR} ({name})" in str(error.value)
+    for layout in LAYOUTS:
+        assert f"{layout.files} ({layout.name})" in str(error.value)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from masiv.errors import InputError
-from masiv.scene.lens import Lens, lens_of
+from masiv.scene.lens import Lens, read_lens
 
 WIDTH, HEIGHT = 64, 48
 K = np.array([[80.0, 0, 29.5], [0, 84.0, 26.0], [0, 0, 1]])
@@ -36,7 +36,7 @@ def test_each_pixel_is_taken_from_where_its_ray_hit_the_sensor(k1, k2, p1, p2, k
     coefficients = np.array([k1, k2, p1, p2, k3])
     lens = Lens(K, coefficients, WIDTH, HEIGHT)
     expected = distorted(rays(lens), *coefficients)
-    if lens.straight:
+    if lens.is_pinhole:
         return
     x, y = lens._maps  # OpenCV counts pixel centres in whole numbers
     np.testing.assert_allclose(np.stack([x, y], axis=-1) + 0.5, expected, atol=1e-3)
@@ -54,9 +54,9 @@ def test_a_ramp_comes_out_as_its_own_coordinate():
     coefficients = np.array([-0.3, 0.1, 0.01, -0.01, 0.02])
     lens = Lens(K, coefficients, WIDTH, HEIGHT)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    found = lens.undistorted(np.stack([2 * x, 4 * y, x], -1).astype(np.uint8))[..., :2] / [2.0, 4.0]
+    found = lens.undistort(np.stack([2 * x, 4 * y, x], -1).astype(np.uint8))[..., :2] / [2.0, 4.0]
     expected = distorted(rays(lens), *coefficients)
-    inside = lens.seen & (expected > 1).all(-1) & (expected < [WIDTH - 1, HEIGHT - 1]).all(-1)
+    inside = lens.visible & (expected > 1).all(-1) & (expected < [WIDTH - 1, HEIGHT - 1]).all(-1)
     assert inside.mean() > 0.8
     assert np.abs(found - expected)[inside].max() < 0.27  # eight bits: a quarter of a pixel
     assert np.abs((found - expected)[inside].mean(axis=0)).max() < 0.03
@@ -65,27 +65,27 @@ def test_a_ramp_comes_out_as_its_own_coordinate():
 def test_every_pixel_of_the_pinhole_picture_was_seen():
     for k1 in (-0.3, 0.3):
         lens = Lens(K, np.array([k1, 0, 0, 0, 0]), WIDTH, HEIGHT)
-        assert lens.seen.mean() > 0.97
+        assert lens.visible.mean() > 0.97
 
 
 def test_transparent_colour_does_not_leak_into_the_rim():
     pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     pixels[10:30, 10:40] = (200, 100, 50, 255)  # black where transparent
-    out = Lens(K, np.array([-0.2, 0, 0, 0, 0]), WIDTH, HEIGHT).undistorted(pixels)
+    out = Lens(K, np.array([-0.2, 0, 0, 0, 0]), WIDTH, HEIGHT).undistort(pixels)
     rim = (out[..., 3] > 20) & (out[..., 3] < 235)
     assert rim.sum() > 20
     assert np.abs(out[rim][:, :3].astype(int) - [200, 100, 50]).max() <= 10
 
 
 def test_no_distortion_changes_nothing():
-    lens = lens_of({"fl_x": 80.0, "cx": 29.5, "cy": 26.0, "camera_model": "SIMPLE_PINHOLE"}, WIDTH, HEIGHT, "here")
+    lens = read_lens({"fl_x": 80.0, "cx": 29.5, "cy": 26.0, "camera_model": "SIMPLE_PINHOLE"}, WIDTH, HEIGHT, "here")
     picture = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-    assert lens.undistorted(picture) is picture
+    assert lens.undistort(picture) is picture
     np.testing.assert_array_equal(lens.pinhole, [[80, 0, 29.5], [0, 80, 26], [0, 0, 1]])
 
 
 def test_angles_give_focal_lengths():
-    lens = lens_of({"camera_angle_x": math.pi / 2, "camera_angle_y": math.pi / 3}, WIDTH, HEIGHT, "here")
+    lens = read_lens({"camera_angle_x": math.pi / 2, "camera_angle_y": math.pi / 3}, WIDTH, HEIGHT, "here")
     np.testing.assert_allclose(lens.pinhole[0], [WIDTH / 2, 0, WIDTH / 2])
     np.testing.assert_allclose(lens.pinhole[1], [0, HEIGHT / 2 * math.sqrt(3), HEIGHT / 2])
 
@@ -103,4 +103,4 @@ def test_angles_give_focal_lengths():
 )
 def test_a_lens_that_cannot_be(row, message):
     with pytest.raises(InputError, match=message):
-        lens_of(row, WIDTH, HEIGHT, "here")
+        read_lens(row, WIDTH, HEIGHT, "here")

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from small import NODES, SMALL, SUBSTEPS
 
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.blend import BlendedLaw, blend
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import strain_invariants
-from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.simulator import Simulator
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.report.film import balls
 from masiv.scene.scene import Ground
-from masiv.simulation.simulate import Push, simulate
+from masiv.simulation.force import ForcePulse
+from masiv.simulation.simulate import simulate
 from masiv.simulation.variation import with_body_of, with_density, with_ground, with_mesh
 from masiv.twin import Twin
 
@@ -36,9 +37,9 @@ def twin(law=None, up=(0.0, 1.0, 0.0), **changes):
         positions=cube.astype(np.float32), velocity=np.array([0.4, 0.5, 0.0]), omega=np.zeros(3), gravity=GRAVITY,
         ground=Ground(up, 0.0), contact="sticky", friction=0.0, volume=SIDE**3, density=1000.0, up=up, fps=FPS,
         law=law or ClassicalLaw("neo_hookean", youngs_modulus=2e4, poissons_ratio=0.3),
-        simulator=SimulatorConfig(grid_nodes=1 << 15, memory_mb=200),
+        simulator=SMALL,
     )  # fmt: skip
-    return Twin(**(settings | changes))
+    return Twin.of_body(**(settings | changes))
 
 
 def neural(material):
@@ -53,7 +54,7 @@ def test_a_force_gives_its_exact_impulse_to_free_flight():
     flying = twin(gravity=np.zeros(3), ground=None, contact="none")
     mass = flying.density * flying.volume
     force = np.array([30.0, -12.0, 45.0])
-    positions = simulate(flying, frames=6, push=Push(force, 0.01, 0.1)).positions.astype(np.float64)
+    positions = simulate(flying, frames=6, force=ForcePulse(force, 0.01, 0.1)).positions.astype(np.float64)
     steps = np.diff(positions.mean(1), axis=0) * FPS
     np.testing.assert_allclose(steps[3:], np.broadcast_to(flying.velocity + force * 0.09 / mass, (2, 3)), atol=2e-5)
     # Before its end the body moves as a constant acceleration moves it, to first order in the substep (a ninth of it).
@@ -64,24 +65,24 @@ def test_a_force_gives_its_exact_impulse_to_free_flight():
 
 def test_a_force_of_minus_the_weight_is_weightlessness():
     body = twin(up=(0.0, 0.0, 1.0), gravity=np.array([0, 0, -9.8]), ground=None, contact="none")
-    held = simulate(body, frames=4, push=Push(np.array([0, 0, 9.8 * 1000 * SIDE**3]))).positions
+    held = simulate(body, frames=4, force=ForcePulse(np.array([0, 0, 9.8 * 1000 * SIDE**3]))).positions
     floating = simulate(replace(body, gravity=np.zeros(3)), frames=4).positions
     np.testing.assert_allclose(held, floating, atol=1e-6)
 
 
 def test_a_force_is_cut_at_its_ends_and_not_at_frames():
-    push = Push(np.ones(3), 0.01, 0.03)
+    push = ForcePulse(np.ones(3), 0.01, 0.03)
     assert push.pieces(0.0, 0.04) == [(0.01, False), (pytest.approx(0.02), True), (pytest.approx(0.01), False)]
     assert push.pieces(0.01, 0.03) == [(pytest.approx(0.02), True)]
     assert push.pieces(0.03, 0.05) == [(pytest.approx(0.02), False)]
-    assert Push(np.ones(3), 0.01, 0.03 + 1e-12).pieces(0.03, 0.05) == [(pytest.approx(0.02), False)]
+    assert ForcePulse(np.ones(3), 0.01, 0.03 + 1e-12).pieces(0.03, 0.05) == [(pytest.approx(0.02), False)]
 
 
 def test_divergence_names_the_substep_from_the_start():
-    blow = Push(np.array([1e7, 0.0, 0.0]), start=2 / FPS)
+    blow = ForcePulse(np.array([1e7, 0.0, 0.0]), start=2 / FPS)
     flying = twin(gravity=np.zeros(3), ground=None, contact="none")
     with pytest.raises(NonFiniteError) as caught:
-        simulate(flying, frames=6, substeps=10, push=blow)
+        simulate(flying, frames=6, substeps=10, force=blow)
     assert 20 <= caught.value.substep < 30
     assert f"substep {caught.value.substep}" in str(caught.value)
 
@@ -89,10 +90,10 @@ def test_divergence_names_the_substep_from_the_start():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Push(np.array([1.0, np.nan, 0])), "--force takes"),
-        (lambda: Push(np.ones(3), -0.1), "--force-from"),
-        (lambda: Push(np.ones(3), 0.2, 0.1), "--force-until"),
-        (lambda: simulate(twin(), frames=3, push=Push(np.ones(3), 0.2)), "last frame is at 0.0833"),
+        (lambda: ForcePulse(np.array([1.0, np.nan, 0])), "--force takes"),
+        (lambda: ForcePulse(np.ones(3), -0.1), "--force-from"),
+        (lambda: ForcePulse(np.ones(3), 0.2, 0.1), "--force-until"),
+        (lambda: simulate(twin(), frames=3, force=ForcePulse(np.ones(3), 0.2)), "last frame is at 0.0833"),
         (lambda: with_density(twin(), 0.0), "--density 0"),
         (lambda: with_ground(twin(), "low"), "--ground low"),
         (lambda: with_ground(twin(), "0.4"), "reaches down to"),
@@ -173,8 +174,8 @@ def test_a_blend_rolls_out_as_its_definition_and_between_its_ends():
 
 def simulator():
     return Simulator(
-        particle_count=216, spacing=0.1, substep=1e-3, volume=0.027, density=1e3, gravity=GRAVITY, memory_mb=200,
-        max_substeps=64, grid_nodes=1 << 15,
+        particle_count=216, spacing=0.1, substep=1e-3, volume=0.027, density=1e3, gravity=GRAVITY,
+        max_substeps=SUBSTEPS, grid_nodes=NODES,
     )  # fmt: skip
 
 
@@ -191,7 +192,7 @@ def test_classical_laws_of_one_kind_blend_their_parameters():
 def test_a_mesh_keeps_mass_size_and_place(tmp_path):
     path = tmp_path / "ball.obj"
     trimesh.creation.icosphere(subdivisions=3, radius=40.0).export(path)  # in millimetres, say
-    body = twin(up=(0.0, 0.0, 1.0))
+    body = twin(up=(0.0, 0.0, 1.0), simulator=SMALL.model_copy(update={"subparticles": 4}))
     ball = with_density(with_mesh(body, path), 700.0)
     true = np.pi / 6 * np.ptp(body.positions, axis=0).max() ** 3  # a ball as wide as the cube's outer points
     assert ball.volume == pytest.approx(true, rel=0.03)
@@ -217,7 +218,7 @@ def test_a_mesh_that_is_open_is_refused(tmp_path):
 
 def test_the_body_of_another_run_keeps_its_size():
     other = twin(volume=0.001, density=400.0)
-    other = replace(other, positions=(0.2 * other.positions + 3).astype(np.float32))
+    other = other.with_body(particles=(0.2 * other.positions + 3).astype(np.float32))
     moved, shift = with_body_of(twin(), other)
     np.testing.assert_allclose(moved.positions, other.positions + shift, atol=1e-6)
     assert moved.volume == 0.001

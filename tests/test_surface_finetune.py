@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from ring_scene import look_at
+from small import SMALL
 from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.checkpoint import Checkpoint
@@ -19,7 +20,6 @@ from masiv.identify.stage import identify
 from masiv.materials.load import load_law
 from masiv.models.initial_state import InitialState
 from masiv.models.problem import Problem
-from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Frame
 from masiv.splat.rasteriser import render
@@ -50,7 +50,7 @@ def filmed(seen):  # noqa: F811
 
 def objective_of(filmed, seen, **changes):  # noqa: F811
     config = settings(**{"pictures": 4, "iterations": 16, **changes})
-    return Objective(Problem(filmed, seen[0], config, SimulatorConfig()))
+    return Objective(Problem(filmed, seen[0], config, SMALL))
 
 
 def trained(objective, error):
@@ -132,7 +132,7 @@ def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers
         pass
 
     config = settings(iterations=4, pictures=1)
-    whole = identify(filmed, seen[0], config, SimulatorConfig())
+    whole = identify(filmed, seen[0], config, SMALL)
     assert whole.fit["silhouette_error_of_surfaces"] > 0
     assert [row["iteration"] for row in whole.fit["history"]] in ([0, 1, 2, 3, 4, 5], [0, 1, 2, 3])
 
@@ -142,8 +142,8 @@ def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers
 
     path = tmp_path / "identify.pt"
     with pytest.raises(Stop):
-        identify(filmed, seen[0], config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0), progress=stops)
-    resumed = identify(filmed, seen[0], config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0))
+        identify(filmed, seen[0], config, SMALL, checkpoint=Checkpoint(path, every_s=0), progress=stops)
+    resumed = identify(filmed, seen[0], config, SMALL, checkpoint=Checkpoint(path, every_s=0))
     assert whole.fit == resumed.fit
     for name, value in whole.law.state_dict().items():
         assert torch.equal(value, resumed.law.state_dict()[name])

@@ -16,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
 from masiv.observations.read import read_observation, read_scene
+from masiv.tracks.declaration import RunDeclaration
 from masiv.tracks.placement import best_rigid
 from masiv.tracks.read import read_tracks
-from masiv.tracks.release import found_release
+from masiv.tracks.release import estimate_release
 from masiv.tracks.summary import gaps, summarise_tracks
 from masiv.tracks.table import read_c3d
-from masiv.tracks.tracks import rest_of
+from masiv.tracks.tracks import rest_positions
 
 MARKERS_AT = {"a": [0, 0, 0], "b": [20, 0, 0], "c": [0, 30, 100]}
 POSE = Rotation.from_rotvec([0.3, -1.1, 0.4]).as_matrix(), np.array([0.2, -0.1, 0.5])
@@ -99,6 +100,14 @@ def test_read_in_metres_with_gaps_and_pose(folder):
     assert len(moving.times) in (19, 20)
     assert 0 <= moving.elapsed[0] < 0.011
     np.testing.assert_array_equal(moving.at_rest, first.at_rest)
+
+
+def test_the_earlier_name_of_ignore_after_release_is_read():
+    run = {"file": "a.csv", "name": "one"}
+    assert RunDeclaration.model_validate({**run, "unsteady": 0.1}).ignore_after_release == 0.1
+    assert RunDeclaration.model_validate({**run, "ignore_after_release": 0.2}).ignore_after_release == 0.2
+    with pytest.raises(ValueError, match="earlier name"):
+        RunDeclaration.model_validate({**run, "unsteady": 0.1, "ignore_after_release": 0.1})
 
 
 def test_heights_of_several_bodies_in_one_long_table(tmp_path):
@@ -208,8 +217,8 @@ def test_release_between_frames(released):
     x += 1e-5 * generator.normal(size=x.shape)
     x[20] += 1.0  # one frame is a glitch, not a release
     rest = slice(0, 15)
-    assert found_release(times, x, rest, *rest_of(x, rest)) == pytest.approx(released, abs=2e-3)
-    assert found_release(times, x[:, 1:], rest, *rest_of(x[:, 1:], rest)) is None
+    assert estimate_release(times, x, rest, *rest_positions(x, rest)) == pytest.approx(released, abs=2e-3)
+    assert estimate_release(times, x[:, 1:], rest, *rest_positions(x[:, 1:], rest)) is None
 
 
 def test_c3d_is_read_with_its_gaps_and_units(folder):

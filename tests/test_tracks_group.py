@@ -13,9 +13,11 @@ import yaml
 
 from masiv.errors import InputError
 from masiv.models.free_body import Model
-from masiv.models.point_mass import RIGID, PointSimulation, mean_diameter, point_runs
+from masiv.models.point_mass import RIGID, PointSimulation, point_runs
 from masiv.refine.config import RefineConfig
-from masiv.refine.pooling import refine_group
+from masiv.refine.from_tracks import refine_group
+from masiv.refine.search_state import SearchSettings
+from masiv.tracks.geometry import mean_diameter
 from masiv.tracks.read import read_tracks
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -65,7 +67,7 @@ def write_scene(folder, balls, noise=0.01, runs=(1, 2)):
 
 
 def found(tracks):
-    return refine_group(tracks, "balls", RefineConfig.model_validate({}))
+    return refine_group(tracks, "balls", SearchSettings.of(RefineConfig.model_validate({})))
 
 
 def test_flight_is_that_of_the_closed_form(tmp_path):
@@ -88,7 +90,7 @@ def test_flight_is_that_of_the_closed_form(tmp_path):
 def test_one_coefficient_where_all_share_it(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.47), "middle": Ball(0.06, 0.065, 0.47), "light": Ball(0.03, 0.08, 0.47)}
     refined = found(write_scene(tmp_path, balls))
-    after = refined.result.after
+    after = refined.search.after
     assert after.model.effects == ("quadratic_drag",)
     name = "quadratic_drag.drag_coefficient"
     assert after.values[name] == pytest.approx(0.47, abs=max(4 * after.stderr[name], 0.005))
@@ -99,27 +101,27 @@ def test_one_coefficient_where_all_share_it(tmp_path):
 def test_own_coefficients_and_a_body_that_lacks_nothing(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "middle": Ball(0.06, 0.065, 0.4), "light": Ball(0.03, 0.08, 0.7)}
     refined = found(write_scene(tmp_path, balls))
-    after = refined.result.after
+    after = refined.search.after
     assert sorted(after.model.effects) == ["quadratic_drag@light", "quadratic_drag@middle"]
     for body in ("middle", "light"):
         name = f"quadratic_drag@{body}.drag_coefficient"
         assert after.values[name] == pytest.approx(balls[body].drag, rel=0.03)
     # One gravity of its own a ball would fit as well as drag, nearly; one of all does not.
-    gravity = next(t for t in refined.result.rounds[0].trials if t.candidate.effect == "gravity_scale")
-    assert any("heavy does not share it" in reason for reason in gravity.reasons)
-    assert not any(c.effect.startswith("gravity_scale@") for c in refined.result.rounds[0].candidates)
-    linear = next(t for t in refined.result.rounds[0].trials if t.candidate.effect == "linear_drag")
-    assert any("it takes a medium of" in reason for reason in linear.reasons)
+    gravity = next(t for t in refined.search.rounds[0].trials if t.candidate.effect == "gravity_scale")
+    assert any("heavy does not share it" in reason for reason in gravity.objections)
+    assert not any(c.effect.startswith("gravity_scale@") for c in refined.search.rounds[0].candidates)
+    linear = next(t for t in refined.search.rounds[0].trials if t.candidate.effect == "linear_drag")
+    assert any("it takes a medium of" in reason for reason in linear.objections)
     [common] = refined.shared
-    assert set(common.bodies) == {"middle", "light"}
-    assert common.gain < 0  # the data asks for one each
+    assert set(common.term.bodies) == {"middle", "light"}
+    assert common.bic_gain < 0  # the data asks for one each
 
 
 def test_clean_flights_lack_nothing(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.0)}
     refined = found(write_scene(tmp_path, balls))
-    assert refined.result.after.model.effects == ()
-    assert refined.simulation.observations[0].noise_std == pytest.approx(0.01, rel=0.4)
+    assert refined.search.after.model.effects == ()
+    assert refined.forward_model.observations[0].noise_std == pytest.approx(0.01, rel=0.4)
 
 
 def test_what_cannot_be_a_group(tmp_path):
@@ -144,12 +146,16 @@ def test_measured_balls():
     from measured import ball_scene
 
     refined = found(ball_scene(measured_folder()))
-    after = refined.result.after
+    after = refined.search.after
     assert sorted(after.model.effects) == [
         "quadratic_drag@Tennis Ball", "quadratic_drag@Whiffle Ball 1", "quadratic_drag@Yellow Whiffle Ball"
     ]  # fmt: skip
-    errors = refined.simulation.by_body(after.model, after.values, fitted=False)
+    errors = refined.forward_model.by_body(after.model, after.values, fitted=False)
     assert errors["Tennis Ball"] < 350
     assert errors["Whiffle Ball 1"] < 300
     assert errors["Bowling Ball"] == pytest.approx(91, abs=2)
-    assert set(refined.refused) == {"Baseball", "Bowling Ball", "Golf Ball"}
+    assert {name for name, body in refined.bodies.items() if body.objections} == {
+        "Baseball",
+        "Bowling Ball",
+        "Golf Ball",
+    }

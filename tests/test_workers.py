@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import multiprocessing
 import os
-import pickle
 import sys
 import time
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small import SMALL
 from test_refine import FITTED, OMEGA, VELOCITY, observed, scene
 
 from masiv import runtime
@@ -27,11 +26,10 @@ from masiv.models.free_body import Model, Simulation, parameters
 from masiv.models.initial_state import InitialState
 from masiv.models.prepare import video_observation
 from masiv.models.problem import Problem
-from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
-from masiv.refine.baselines import DONE, baselines, derived
+from masiv.refine.baselines import ALL_FRAMES_STAGE, baselines, differentiated
 from masiv.refine.config import RefineConfig
-from masiv.refine.tasks import map_tasks, ranked
+from masiv.refine.tasks import map_tasks, rank
 from masiv.workers import TaskError, Workers, process_count, unwrap
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -221,7 +219,7 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
     motion = observed({})
     motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
-    problem = Problem(scene(), motion, config, SimulatorConfig(), chosen=np.arange(0, 512, 4))
+    problem = Problem(scene(), motion, config, SMALL, chosen=np.arange(0, 512, 4))
     throw = InitialState.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
     listening = Listening()
     alone, beside = (choose_starting_laws(Objective(problem), throw, quiet, workers) for workers in (listening, two))
@@ -234,20 +232,12 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
             assert torch.equal(value, b.law.state_dict()[name])
 
 
-def test_a_scene_goes_to_a_process_without_the_pictures_that_were_read():
-    read = scene()
-    read._cache[0, 0] = "a picture"
-    sent = pickle.loads(pickle.dumps(dataclasses.replace(read, load=halved)))
-    assert sent._cache == {}
-    assert sent.path == read.path
-
-
 def small_simulation():
     motion = observed({"linear_drag": [1.0]})
     first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
     config = RefineConfig(particles=200, samples_per_frame=1, laws=["neo_hookean"])
     contact = IdentifyConfig(contact="sticky")
-    observation, *_ = video_observation("run", scene(), first, motion, contact, SimulatorConfig(), config)
+    observation, *_ = video_observation("run", scene(), first, motion, contact, SMALL, config)
     return Simulation([observation]), config
 
 
@@ -258,17 +248,17 @@ def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
         f"{n}_{a}": v for n, vs in (("velocity", VELOCITY), ("omega", OMEGA)) for a, v in zip("xyz", vs, strict=True)
     }
     checkpoint = Checkpoint(tmp_path / "refine.pt")
-    done = FamilyFit("neo_hookean", "sticky", {**law, **throw, "ground_offset": 0.0}, stage=DONE)
+    done = FamilyFit("neo_hookean", "sticky", {**law, **throw, "ground_offset": 0.0}, stage=ALL_FRAMES_STAGE)
     checkpoint.save({"neo_hookean": done.state()})
     unused: Any = None
-    (fitted,) = baselines(simulation, unused, unused, 1, config, checkpoint, quiet)
+    (fitted,) = baselines(simulation, unused, config, checkpoint, quiet, Workers())
     assert {n: fitted.values[n] for n in law} == law
     assert fitted.model.contact == "sticky"
 
 
 @pytest.mark.slow
 def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
-    monkeypatch.setattr("masiv.refine.tasks.NAMES_A_TASK", 1)
+    monkeypatch.setattr("masiv.refine.tasks.EFFECTS_PER_TASK", 1)
     simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
     values = {p.name: p.start for p in parameters(model, simulation.observations)}
@@ -279,8 +269,8 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     found = []
     for workers in (Workers(1), two):
         before = simulation.rollouts
-        (base,) = map_tasks(workers, simulation, derived, [(model, values, 0)])
-        ranking = ranked(workers, simulation, base, robust_scale=1.0, names=names, progress=quiet)
+        (base,) = map_tasks(workers, simulation, differentiated, [(model, values, 0)])
+        ranking = rank(workers, simulation, base, names, robust_scale=1.0, progress=quiet).candidates
         found.append((base, ranking, simulation.rollouts - before))
     (base, ranking, count), (other_base, other, other_count) = found
     assert count == other_count == len(base.parameters) + 2 + len(names)

@@ -1,24 +1,20 @@
-"""What a material tester would measure of a law: stress along prescribed deformations, flow included.
+"""Stress of a law along prescribed deformations, flow included, as a material tester would measure it.
 
-All of it in float64, one material point, driven by increments of the deformation gradient: F <- project(dF F, dt), then
-the stress, as a particle of the simulator does. Stresses are Kirchhoff [Pa], strains logarithmic.
+One material point in float64, driven by increments of the deformation gradient as a particle of the simulator is:
+F <- project(dF F, dt), then the stress. Stresses are Kirchhoff [Pa], strains logarithmic.
 """
 
 from __future__ import annotations
 
-import copy
-import functools
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
 
 from masiv.materials.law import Law
 
-L = TypeVar("L", bound=Law)
-SMALL = 1e-5
-"""Strain of the finite differences at rest."""
+DIFFERENCE_STRAIN = 1e-5
+"""Strain [1] of the finite differences at rest."""
 
 
 @dataclass(frozen=True)
@@ -35,45 +31,25 @@ class Curve:
         return self.strain - self.elastic
 
 
-def exact(law: Law) -> Law:
-    """A copy of ``law`` in float64 whose parameters need no gradient and do not change any more."""
-    return tabulated(copy.deepcopy(law).double())
-
-
-def tabulated(law: L) -> L:
-    """A copy of ``law`` that has looked at its networks once, where it is one that interpolates their values, and
-    remembers its coefficients, where it is a classical one.
-
-    Its parameters must not be changed.
-    """
-    law = copy.deepcopy(law).requires_grad_(False)
-    for name in ("moduli_table", "rate_table"):
-        if hasattr(law, name):
-            setattr(law, name, functools.partial(_known, getattr(law, name)()))
-    for name in ("flow_table", "coefficients"):
-        if hasattr(law, name):
-            setattr(law, name, functools.lru_cache(maxsize=8)(getattr(law, name)))
-    return law
-
-
-def _known(table: torch.Tensor) -> torch.Tensor:
-    return table
+def in_float64(law: Law) -> Law:
+    """A frozen copy of ``law`` in float64."""
+    return law.frozen().double()
 
 
 def moduli_at_rest(law: Law) -> tuple[float, float]:
     """Shear and bulk modulus [Pa] of the stress at F = I, nothing flowing: 2 G = d tau_dev / d eps, K = dp / d ln J."""
-    law = exact(law)
-    strain = torch.tensor([[SMALL, -SMALL, 0.0], [SMALL, SMALL, SMALL]], dtype=torch.float64)
+    law = in_float64(law)
+    strain = DIFFERENCE_STRAIN * torch.tensor([[1.0, -1.0, 0.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
     with torch.no_grad():
         forth, back = (law.stress(torch.diag_embed(torch.exp(sign * strain))) for sign in (1, -1))
-    slope = (forth - back) / (2 * SMALL)
+    slope = (forth - back) / (2 * DIFFERENCE_STRAIN)
     return float(slope[0, 0, 0] - slope[0, 1, 1]) / 4, float(slope[1].trace()) / 9
 
 
 def drive(law: Law, increments: torch.Tensor, dt: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Elastic gradients and stresses (T, B, 3, 3) of B points from rest under ``increments`` (T, B, 3, 3), dt [s] each.
 
-    law: in float64, see ``exact``.
+    law: in float64, see ``in_float64``.
     """
     state = torch.eye(3, dtype=torch.float64).expand(increments.shape[1:])
     states = []
@@ -113,7 +89,7 @@ def dilation(log_volumes: np.ndarray) -> torch.Tensor:
 
 def uniaxial(law: Law, strains: np.ndarray, dt: float) -> Curve:
     """Axial stress at axial strains (T,), dt [s] an increment, with the sides free: their stretch is solved for."""
-    law = exact(law)
+    law = in_float64(law)
     state = torch.eye(3, dtype=torch.float64)[None]
     stresses, elastic = [], []
     with torch.no_grad():
@@ -128,7 +104,7 @@ def _free_sides(law: Law, state: torch.Tensor, step: float, dt: float) -> tuple[
     """The state (1, 3, 3) and stress (3, 3) after an axial strain ``step`` whose side stress is zero.
 
     Regula falsi (Illinois). Without a change of sign, as of a heap that carries nothing sideways, the side is let go
-    where its stress is least.
+    at its least stress.
     """
 
     def tried(side: float) -> tuple[float, torch.Tensor, torch.Tensor]:
@@ -173,7 +149,7 @@ def deviatoric_strain(gradients: torch.Tensor) -> torch.Tensor:
 
 def kept_shear(law: Law, shear: float, log_volume: float, hold: float) -> float:
     """The share of a small ``shear``, put on at once at ln J = ``log_volume``, that is elastic after ``hold`` [s]."""
-    law = exact(law)
+    law = in_float64(law)
     start = simple_shear(np.array([shear]), log_volume)
     with torch.no_grad():
         after = start
@@ -184,7 +160,7 @@ def kept_shear(law: Law, shear: float, log_volume: float, hold: float) -> float:
 
 def relaxation_time(law: Law, shear: float, log_volume: float = 0.0, longest: float = 10.0) -> float | None:
     """Time [s] until the stress of a ``shear``, put on at once and held, falls to 1/e, or None."""
-    law = exact(law)
+    law = in_float64(law)
     state, time, step = simple_shear(np.array([shear]), log_volume), 0.0, 1e-6
     with torch.no_grad():
         before = first = float(law.stress(state)[0, 0, 1])

@@ -60,14 +60,14 @@ def identify(
         result = _fit(recordings, _coarse(scene, trajectory, recordings[0], seed), seed, checkpoint, progress)
     initial_motion = prepared[0][1]
     axes, initial_state = recordings[0].objective.problem.axes, result.initial_state
-    return Twin(
+    return Twin.of_body(
+        observation=scene.path.resolve().name,
         positions=np.asarray(trajectory.positions[0], dtype=np.float32),
         velocity=axes.vectors_to_world(initial_state.velocity.double().numpy()),
         omega=axes.vectors_to_world(initial_state.omega.double().numpy()),
         gravity=np.asarray(scene.gravity, dtype=np.float64),
         ground=initial_state.ground(scene.ground),
         contact=result.contact,
-        friction=0.0,
         volume=trajectory.volume,
         density=scene.density,
         up=np.asarray(scene.up, dtype=np.float64),
@@ -108,20 +108,12 @@ def relearn(
     coarse = _coarse(scene, trajectory, recording, seed, twin)
     with runtime.torch_threads(1):
         result = fit_neural_law([recording], coarse, seed, checkpoint or Checkpoint(None), progress)
-    return replace(
-        twin,
-        velocity=axes.vectors_to_world(result.initial_state.velocity.double().numpy()),
-        omega=axes.vectors_to_world(result.initial_state.omega.double().numpy()),
-        ground=result.initial_state.ground(scene.ground),
-        contact=result.contact,
-        law=result.law,
-        fit={
-            **twin.fit,
-            **result.report,
-            "trajectory_error_mm": 1e3 * result.trajectory_error,
-            "history": result.history,
-        },
-    )
+    fitted = result.initial_state
+    velocity, omega = (axes.vectors_to_world(v.double().numpy()) for v in (fitted.velocity, fitted.omega))
+    learned = twin.with_body(law=result.law).with_motion(velocity=velocity, omega=omega)
+    learned = learned.with_boundary(ground=fitted.ground(scene.ground), contact=result.contact)
+    errors = {"trajectory_error_mm": 1e3 * result.trajectory_error, "history": result.history}
+    return replace(learned, fit={**twin.fit, **result.report, **errors})
 
 
 def _coarse(

@@ -57,7 +57,7 @@ def simulation_of(
 
     spacing = (body.geometry.volume / config.particles) ** (1 / 3)
     runs = [
-        body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.unsteady)
+        body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.ignore_after_release)
         for run in runs_of(tracks, condition)
     ]
     last = max(float(run.times[-1]) for run in runs)

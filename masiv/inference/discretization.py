@@ -1,8 +1,8 @@
-"""What other grids would change: how much there is of it is fitted, and what differs from grid to grid is uncertain.
+"""What other grids would change: how much of it there is is fitted, and what differs from grid to grid is uncertain.
 
 A rollout of few particles on a coarse grid differs from those on finer ones mostly in one way, that of a body which
 bounces a little more or a little less than it should. So their mean change, worked out once as the model moves, is
-added to the model in a share that is fitted (deferred correction, with a free factor), as a throw is.
+added to the model with a factor that is fitted (deferred correction with a free factor), as an initial velocity is.
 """
 
 from __future__ import annotations
@@ -10,54 +10,55 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from masiv.inference.least_squares import robust_weight
 from masiv.inference.model_fit import ModelFit
-from masiv.models.base import ForwardModel
+from masiv.inference.robust import soft_l1_weight
+from masiv.models.base import ForwardModel, Observation
 from masiv.models.free_body import GRID_CHANGE
 
 
 def with_residual_std(
-    simulation: ForwardModel, fitted: ModelFit, observation_std: Sequence[np.ndarray]
-) -> tuple[Any, ...]:
-    """The experiments of ``simulation`` with what finer grids change, as ``fitted`` moves, and with sigma (K,): the
-    root mean square distance by which model and observation may differ at each instant with nothing missing. That is
-    the error of the ``observation_std`` (K,), and by how much one more grid may differ from the others in what no fit
-    absorbs; in free flight that is nothing.
+    forward_model: ForwardModel, fitted: ModelFit, observation_std: Sequence[np.ndarray]
+) -> ForwardModel:
+    """``forward_model`` with observations that know what finer grids change as ``fitted`` moves, and ``residual_std``
+    (T,) [m]: the root mean square distance by which model and observation may differ at each instant with nothing
+    missing. That is the error of the observation, ``observation_std`` (T,) [m], and by how much one more grid may
+    differ from the others in what no fit absorbs; in free flight that is nothing.
 
-    Sigma is not less than before as time goes on, since errors of the simulation grow. Raises NonFiniteError.
+    It does not fall as time goes on, since errors of the simulation grow. Raises NonFiniteError.
     """
-    observations = simulation.observations
-    found = [simulation.finer_grids(fitted.model, fitted.values, k) for k in range(len(observations))]
-    if not all(found):
-        return tuple(replace(e, residual_std=seen) for e, seen in zip(observations, observation_std, strict=True))
-    mean = [np.mean(changes, axis=0) for changes in found]
-    kept = [_not_absorbed(simulation, fitted, observation_std, each, mean) for each in zip(*found, strict=True)]
+    observations = forward_model.observations
+    changes = [forward_model.finer_grids(fitted.model, fitted.values, k) for k in range(len(observations))]
+    if not all(changes):
+        return forward_model.with_observations(
+            [replace(e, residual_std=seen) for e, seen in zip(observations, observation_std, strict=True)]
+        )
+    mean = [np.mean(own, axis=0) for own in changes]
+    kept = [_not_absorbed(observations, fitted, observation_std, each, mean) for each in zip(*changes, strict=True)]
     more = _one_more(len(kept))
     out = []
     for k, (e, seen) in enumerate(zip(observations, observation_std, strict=True)):
-        whole = np.sqrt(np.mean([_size(change) ** 2 for change in found[k]], axis=0))
+        whole = np.sqrt(np.mean([_size(change) ** 2 for change in changes[k]], axis=0))
         grid = np.minimum(more * np.sqrt(np.mean([each[k] ** 2 for each in kept], axis=0)), whole)
-        out.append(replace(e, residual_std=np.hypot(seen, np.maximum.accumulate(grid)), grid_changes=tuple(found[k])))
-    return tuple(out)
+        std = np.hypot(seen, np.maximum.accumulate(grid))
+        out.append(replace(e, residual_std=std, grid_changes=tuple(changes[k])))
+    return forward_model.with_observations(out)
 
 
-def with_grid_errors(simulation: ForwardModel, fitted: ModelFit, robust_scale: float) -> ModelFit:
-    """``fitted`` with standard errors that hold, beside what noise does to the values, by how much they would move if
-    the truth were one more grid: with what it changes beyond the mean, which no share makes up for.
+def with_grid_errors(observations: Sequence[Observation], fitted: ModelFit, robust_scale: float) -> ModelFit:
+    """``fitted`` with standard errors that hold, in addition to what noise does to the values, by how much they would
+    move if the truth were one more grid: with what it changes beyond the mean, which no factor makes up for.
 
-    soft [m]: residuals from which on a weighted residual counts as wild.
+    robust_scale [m]: whitened residuals above it are outliers.
     """
-    observations = simulation.observations
     if not all(e.grid_changes for e in observations) or not fitted.parameters:
         return fitted
     beyond = [
         [e.whiten((c - np.mean(e.grid_changes, axis=0))[: e.fit_count]) for c in e.grid_changes] for e in observations
     ]
-    weight = robust_weight(fitted.residual, robust_scale)
+    weight = soft_l1_weight(fitted.residual, robust_scale)
     columns = fitted.jacobian * weight[:, None]
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     moved = []
@@ -78,24 +79,23 @@ def _one_more(count: int) -> float:
 
 
 def _size(field: np.ndarray) -> np.ndarray:
-    """Root mean square length (K,) of a field (K, N, A)."""
+    """Root mean square length (T,) of a field (T, N, A)."""
     return np.sqrt((field**2).sum(2).mean(1))
 
 
 def _not_absorbed(
-    simulation: ForwardModel,
+    observations: Sequence[Observation],
     fitted: ModelFit,
     observation_std: Sequence[np.ndarray],
     changes: Sequence[np.ndarray],
     mean: Sequence[np.ndarray],
 ) -> list[np.ndarray]:
-    """For each experiment, the root mean square (K,) [m] of what one grid ``changes`` (K, N, A) and no fit absorbs.
+    """For each observation, the root mean square (T,) [m] of what one grid ``changes`` (T, N, A) and no fit absorbs.
 
-    A fit absorbs the change's part along the derivatives of ``fitted`` and along the ``mean`` change (K, N, A) of all
-    grids. After the fitted instants, of what is not along that mean the same share as at their end is taken to be
+    A fit absorbs the change's part along the derivatives of ``fitted`` and along the ``mean`` change (T, N, A) of all
+    grids. After the fitted instants, of what is not along that mean the same part as at their end is taken to be
     absorbed.
     """
-    observations = simulation.observations
     weights = [
         e.noise_std / np.hypot(seen, np.maximum.accumulate(_size(change)))
         for change, seen, e in zip(changes, observation_std, observations, strict=True)
@@ -111,7 +111,7 @@ def _not_absorbed(
     shares = np.zeros((ends[-1], len(parts)))
     for k, part in enumerate(flat(mean)):
         shares[ends[k] - len(part) : ends[k], k] = part
-    # The derivatives are weighted by the sigma so far.
+    # The derivatives are whitened by the residual_std so far.
     again = [
         np.broadcast_to((e.residual_std / e.noise_std)[:, None, None], c.shape)
         for c, e in zip(changes, observations, strict=True)

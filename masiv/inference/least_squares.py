@@ -1,31 +1,87 @@
-"""Least squares over a few parameters of a simulation, by finite differences: no adjoint is needed.
+"""Least squares over a few parameters of a simulation. Derivatives are finite differences: no adjoint is needed.
 
-Gauss-Newton in a trust region (SciPy's ``least_squares``, Branch, Coleman & Li 1999), one residual evaluation a
-parameter for the Jacobian. Standard errors are those of linear regression at the solution.
+Two algorithms for two prices. ``gauss_newton`` takes fresh derivatives at each step, one evaluation of the residual a
+parameter (trust region of SciPy's ``least_squares``, Branch, Coleman & Li 1999). ``broyden`` keeps a Jacobian that is
+known and updates it (Broyden 1965; damping as of Levenberg and Marquardt): one evaluation a step. They share bounds,
+scales of parameters and the robust loss (``masiv.inference.robust``).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from masiv.errors import MasivError, NonFiniteError
+from masiv.inference.robust import NORMAL_MAD, soft_l1_mean_square, soft_l1_sum, soft_l1_weight
 from masiv.models.parameters import Parameter
 
+Residual = Callable[[dict[str, float]], np.ndarray]
+"""Values by name -> residual (M,). Raises NonFiniteError if the simulation diverges."""
 FIRST_STEP = 10.0
-"""The trust region begins at this many finite-difference steps: as far as a linear model deserves to be believed."""
+"""Radius of the first trust region, and longest step of ``broyden``, in finite-difference steps."""
 STEP_TOLERANCE = 1e-3
-"""The fit ends when its steps are this share of a finite-difference step."""
+"""A fit ends if its steps are shorter than this part of a finite-difference step."""
+MIN_DECREASE = 1e-3
+"""A fit ends if a step lowers the cost by less than this part of it."""
+FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-6, 1e6
+"""Levenberg-Marquardt damping over the diagonal of the normal equations."""
+MAX_LOG_JUMP = 0.7
+"""Longest step of ``gauss_newton_jump`` in the logarithm of a parameter."""
+
+
+def with_start_values(parameters: Sequence[Parameter], values: Mapping[str, float]) -> tuple[Parameter, ...]:
+    """Parameters that start at ``values`` (at their own start if not given), within their bounds."""
+    return tuple(replace(p, start=float(np.clip(values.get(p.name, p.start), p.lower, p.upper))) for p in parameters)
+
+
+def clipped_step(parameters: Sequence[Parameter], values: Mapping[str, float], step: np.ndarray) -> dict[str, float]:
+    """``values`` after a ``step`` (P,) in the fitted scales, each part at most ``FIRST_STEP`` finite-difference steps
+    long, within the bounds."""
+    out = dict(values)
+    for p, delta in zip(parameters, step, strict=True):
+        limit = FIRST_STEP * p.step
+        out[p.name] = p.value(p.fitted(values[p.name]) + float(np.clip(delta, -limit, limit)))
+    return out
+
+
+def free_parameters(parameters: Sequence[Parameter], values: Mapping[str, float], descent: np.ndarray) -> np.ndarray:
+    """Indices of parameters that are not at a bound which the ``descent`` direction (P,) would cross."""
+    out = []
+    for k, p in enumerate(parameters):
+        here = values[p.name]
+        if not ((here <= p.lower and descent[k] < 0) or (here >= p.upper and descent[k] > 0)):
+            out.append(k)
+    return np.array(out, dtype=int)
+
+
+def derivative(residual: Residual, values: Mapping[str, float], here: np.ndarray, p: Parameter) -> np.ndarray:
+    """Derivative (M,) of the residual, which is ``here`` (M,) at ``values``, with respect to ``p`` in its fitted scale:
+    a finite difference within the bounds. Raises NonFiniteError if the simulation diverges on both sides."""
+    centre = p.fitted(values[p.name])
+    sides = [1.0, -1.0] if centre + p.step <= p.fitted(p.upper) else [-1.0, 1.0]
+    for side in sides:
+        shifted = {**values, p.name: p.value(centre + side * p.step)}
+        actual = p.fitted(shifted[p.name]) - centre
+        if actual == 0:
+            continue
+        try:
+            return (residual(shifted) - here) / actual
+        except NonFiniteError:
+            continue
+    raise NonFiniteError(0, 0, f"the simulation diverges on both sides of {p.name} = {values[p.name]:.4g}")
+
+
+# -- Gauss-Newton with fresh derivatives -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a fit found.
+    """Result of ``gauss_newton``.
 
     values: by name, in each parameter's own unit. covariance (P, P): fitted scale, of independent residuals whose
     variance is that of ``residual``. jacobian (M, P): per fitted scale, at ``values``. residual (M,).
@@ -40,18 +96,14 @@ class Estimate:
     parameters: tuple[Parameter, ...]
 
     def stderr(self, effective_samples: int) -> dict[str, float]:
-        """Standard errors in each parameter's own unit, where the M residuals are worth ``effective_samples``
-        independent ones: exact where each is repeated M / effective_samples times. Infinite where those are no more
-        than the parameters, and where the data does not depend on a parameter."""
+        """Standard errors in each parameter's own unit, if the M residuals are worth ``effective_samples`` independent
+        ones: exact if each is repeated M / effective_samples times. Infinite if those are no more than the parameters,
+        and if the data does not depend on a parameter."""
         size, count = self.jacobian.shape
         if effective_samples <= count:
             return {p.name: math.inf for p in self.parameters}
         inflation = max(size - count, 1) / (effective_samples - count)
-        errors = np.sqrt(np.diag(self.covariance) * inflation)
-        return {
-            p.name: float(error * (abs(self.values[p.name]) if p.log else 1.0))
-            for p, error in zip(self.parameters, errors, strict=True)
-        }
+        return standard_errors(self.parameters, self.values, np.diag(self.covariance) * inflation)
 
 
 class _Spent(Exception):
@@ -61,14 +113,14 @@ class _Spent(Exception):
 class _Evaluator:
     """Residuals and Jacobians in units of ``FIRST_STEP`` finite-difference steps from the start."""
 
-    def __init__(self, residual, parameters: tuple[Parameter, ...], max_evaluations: int) -> None:
+    def __init__(self, residual: Residual, parameters: tuple[Parameter, ...], max_evaluations: int) -> None:
         self.residual = residual
         self.parameters = parameters
         self.start = np.array([p.fitted(p.start) for p in parameters])
         self.scale = FIRST_STEP * np.array([p.step for p in parameters])
-        self.left = max_evaluations
+        self.max_evaluations = max_evaluations
         self.count = 0
-        self.softness = math.inf  # residuals well above it are wild: none
+        self.robust_scale = math.inf
         self.best: tuple[float, np.ndarray, np.ndarray] | None = None
         self.jacobian_at: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -78,43 +130,40 @@ class _Evaluator:
 
     def call(self, u: np.ndarray) -> np.ndarray:
         self.count += 1
-        found = np.asarray(self.residual(self.values(u)), dtype=np.float64).ravel()
-        if not np.isfinite(found).all():
+        out = np.asarray(self.residual(self.values(u)), dtype=np.float64).ravel()
+        if not np.isfinite(out).all():
             raise NonFiniteError(0, 0, "a residual is not finite")
-        return found
-
-    def cost(self, found: np.ndarray) -> float:
-        return robust_cost(found, self.softness)
+        return out
 
     def trial(self, u: np.ndarray) -> np.ndarray:
-        """The residual, infinite where the simulation diverges: the trust region then shrinks."""
+        """The residual, infinite if the simulation diverges: the trust region then shrinks."""
         if self.best is not None and np.array_equal(u, self.best[1]):
             return self.best[2]
-        if self.best is not None and self.count + 1 + len(self.parameters) > self.left:
+        if self.best is not None and self.count + 1 + len(self.parameters) > self.max_evaluations:
             raise _Spent
         try:
-            found = self.call(u)
+            out = self.call(u)
         except NonFiniteError:
             if self.best is None:
                 raise
             return np.full(len(self.best[2]), np.inf)
-        cost = self.cost(found)
+        cost = soft_l1_sum(out, self.robust_scale)
         if self.best is None or cost < self.best[0]:
-            self.best = cost, u.copy(), found
-        return found
+            self.best = cost, u.copy(), out
+        return out
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
-        """Forward differences, backward where forward leaves the bounds or diverges; (M, P) per unit of u."""
+        """Forward differences, backward if forward leaves the bounds or diverges; (M, P) per unit of u."""
         base = self.trial(u)
         columns = []
         for k, p in enumerate(self.parameters):
             fitted = self.start[k] + self.scale[k] * u[k]
             sides = [1.0, -1.0] if fitted + p.step <= p.fitted(p.upper) else [-1.0, 1.0]
             for side in sides:
-                moved = u.copy()
-                moved[k] += side / FIRST_STEP
+                shifted = u.copy()
+                shifted[k] += side / FIRST_STEP
                 try:
-                    columns.append((self.call(moved) - base) * (FIRST_STEP * side))
+                    columns.append((self.call(shifted) - base) * (FIRST_STEP * side))
                     break
                 except NonFiniteError:
                     continue
@@ -127,8 +176,8 @@ class _Evaluator:
         return self.jacobian_at[1]
 
 
-def fit_parameters(
-    residual: Callable[[dict[str, float]], np.ndarray],
+def gauss_newton(
+    residual: Residual,
     parameters: Sequence[Parameter],
     *,
     max_evaluations: int,
@@ -138,67 +187,168 @@ def fit_parameters(
     """The values with the least sum of squares of ``residual`` (M,), from ``Parameter.start``, within the bounds.
 
     A NonFiniteError of the residual refuses the step. max_evaluations: calls of the residual in all; at least one
-    residual and one Jacobian are taken. robust: least sum of 2 (sqrt(1 + r^2 / s^2) - 1), with s the median size at the
-    start, so that a few wild residuals pull less; the covariance is then that of the reweighted problem. tolerance: the
-    fit also ends where a step lowers the cost by less than this share.
-    Raises NonFiniteError where the start itself diverges, MasivError where the simulation diverges all around a point.
+    residual and one Jacobian are taken. robust: least ``soft_l1_sum``, its scale the standard deviation that the median
+    at the start tells; the covariance is then that of the reweighted problem. tolerance: the fit also ends if a step
+    lowers the cost by less than this part of it.
+    Raises NonFiniteError if the start itself diverges, MasivError if the simulation diverges all around a point.
     """
     evaluator = _Evaluator(residual, tuple(parameters), max_evaluations)
     origin = np.zeros(len(evaluator.parameters))
     first = evaluator.trial(origin)
-    softness = max(1.4826 * float(np.median(np.abs(first))), 1e-12)
+    scale = max(NORMAL_MAD * float(np.median(np.abs(first))), 1e-12)
     if robust:
-        evaluator.softness = softness
-        evaluator.best = evaluator.cost(first), origin, first
+        evaluator.robust_scale = scale
+        evaluator.best = soft_l1_sum(first, scale), origin, first
     lower = [(p.fitted(p.lower) - x) / s for p, x, s in zip(parameters, evaluator.start, evaluator.scale, strict=True)]
     upper = [(p.fitted(p.upper) - x) / s for p, x, s in zip(parameters, evaluator.start, evaluator.scale, strict=True)]
     try:
         result = least_squares(
             evaluator.trial, origin, cast(Any, evaluator.jacobian), (lower, upper), "trf",
             xtol=STEP_TOLERANCE / FIRST_STEP, ftol=tolerance, gtol=cast(Any, None),
-            loss="soft_l1" if robust else "linear", f_scale=softness, max_nfev=max(max_evaluations, 1),
+            loss="soft_l1" if robust else "linear", f_scale=scale, max_nfev=max(max_evaluations, 1),
         )  # fmt: skip
-        u, found = result.x, result.fun
+        u, last = result.x, result.fun
     except _Spent:
         assert evaluator.best is not None
-        _, u, found = evaluator.best
+        _, u, last = evaluator.best
     if evaluator.jacobian_at is None or not np.array_equal(evaluator.jacobian_at[0], u):
         evaluator.jacobian(u)
     assert evaluator.jacobian_at is not None
     jacobian = evaluator.jacobian_at[1] / evaluator.scale
-    weight = robust_weight(found, softness) if robust else np.ones(len(found))
+    weight = soft_l1_weight(last, scale) if robust else np.ones(len(last))
     return Estimate(
         evaluator.values(u),
-        covariance(jacobian * weight[:, None], found * weight),
+        covariance(jacobian * weight[:, None], last * weight),
         jacobian,
-        found,
+        last,
         evaluator.count,
         evaluator.parameters,
     )
 
 
-def robust_cost(residual: np.ndarray, softness: float) -> float:
-    """What is made small: the sum of sqrt(1 + r^2 / s^2) - 1, or of squares where the ``softness`` s is infinite."""
-    if math.isinf(softness):
-        return float(residual @ residual)
-    return float((np.sqrt(1 + (residual / softness) ** 2) - 1).sum())
+# -- steps with a Jacobian that is known -----------------------------------------------------------------------------
 
 
-def robust_weight(residual: np.ndarray, softness: float) -> np.ndarray:
-    """Factors that make least squares of the weighted residual (M,) a step of the robust problem."""
-    return (1 + (residual / softness) ** 2) ** -0.25
+@dataclass(frozen=True)
+class Linearization:
+    """A residual (M,) at ``values`` and its jacobian (M, P) by the fitted scales of P parameters."""
+
+    values: dict[str, float]
+    residual: np.ndarray
+    jacobian: np.ndarray
+
+
+def linearize(residual: Residual, parameters: Sequence[Parameter], values: Mapping[str, float]) -> Linearization:
+    """Residual and derivatives at ``values``. Raises NonFiniteError."""
+    here = residual(dict(values))
+    columns = [derivative(residual, values, here, p) for p in parameters]
+    return Linearization(dict(values), here, np.stack(columns, axis=1) if columns else np.zeros((len(here), 0)))
+
+
+def broyden(
+    residual: Residual, parameters: Sequence[Parameter], start: Linearization, *, steps: int, robust_scale: float
+) -> Linearization:
+    """Damped Gauss-Newton ``steps`` from ``start``, whose Jacobian is updated by what each step changed: one evaluation
+    a step, which a NonFiniteError refuses."""
+    here = start
+    scale = np.array([p.step for p in parameters])
+    damping = FIRST_DAMPING
+    cost = soft_l1_mean_square(here.residual, robust_scale)
+    for _ in range(steps):
+        normal, right = _normal_equations(here, scale, robust_scale)
+        free = free_parameters(parameters, here.values, right)
+        step = np.zeros(len(parameters))
+        step[free] = _damped_solution(normal[np.ix_(free, free)], right[free], damping)
+        trial = clipped_step(parameters, here.values, step * scale)
+        actual = _difference(parameters, here.values, trial)
+        if not np.any(actual):
+            break
+        try:
+            reached = residual(trial)
+        except NonFiniteError:
+            damping = max(10 * damping, 0.1)
+            continue
+        jacobian = _updated(here.jacobian, reached - here.residual, actual, scale)
+        decrease = cost - soft_l1_mean_square(reached, robust_scale)
+        if decrease > 0:
+            done = decrease < MIN_DECREASE * cost
+            here, cost = Linearization(trial, reached, jacobian), cost - decrease
+            damping = max(damping / 5, MIN_DAMPING)
+            if done:
+                break
+        else:
+            here = replace(here, jacobian=jacobian)
+            damping = min(max(20 * damping, 0.05), MAX_DAMPING)
+    return here
+
+
+def gauss_newton_jump(
+    residual: Residual, parameters: Sequence[Parameter], start: Linearization, *, robust_scale: float
+) -> Linearization:
+    """The minimum of the linear model of ``start`` if it is better than ``start``, else ``start``: forces are nearly
+    linear, and steps of a careful length might never get there. One evaluation."""
+    scale = np.array([p.step for p in parameters])
+    normal, right = _normal_equations(start, scale, robust_scale)
+    step = _damped_solution(normal, right, FIRST_DAMPING) * scale
+    trial = dict(start.values)
+    for p, delta in zip(parameters, step, strict=True):
+        limit = MAX_LOG_JUMP if p.log else math.inf
+        trial[p.name] = p.value(p.fitted(start.values[p.name]) + float(np.clip(delta, -limit, limit)))
+    try:
+        reached = residual(trial)
+    except NonFiniteError:
+        return start
+    if soft_l1_mean_square(reached, robust_scale) >= soft_l1_mean_square(start.residual, robust_scale):
+        return start
+    actual = _difference(parameters, start.values, trial)
+    return Linearization(trial, reached, _updated(start.jacobian, reached - start.residual, actual, scale))
+
+
+def _normal_equations(at: Linearization, scale: np.ndarray, robust_scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix (P, P) and right side (P,) of one robust Gauss-Newton step, in units of ``scale`` (P,)."""
+    weight = soft_l1_weight(at.residual, robust_scale)
+    a = (at.jacobian * scale) * weight[:, None]
+    return a.T @ a, a.T @ (-at.residual * weight)
+
+
+def _damped_solution(normal: np.ndarray, right: np.ndarray, damping: float) -> np.ndarray:
+    return np.linalg.lstsq(normal + damping * np.diag(np.diag(normal)), right, rcond=1e-10)[0]
+
+
+def _difference(parameters: Sequence[Parameter], before: Mapping[str, float], after: Mapping[str, float]) -> np.ndarray:
+    """Step (P,) in the fitted scales."""
+    return np.array([p.fitted(after[p.name]) - p.fitted(before[p.name]) for p in parameters])
+
+
+def _updated(jacobian: np.ndarray, change: np.ndarray, step: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Broyden's update: the ``jacobian`` (M, P) that gives ``change`` (M,) for ``step`` (P,), which is not zero."""
+    length = step / scale
+    return jacobian + np.outer(change - jacobian @ step, length / scale) / (length @ length)
+
+
+# -- standard errors -------------------------------------------------------------------------------------------------
 
 
 def covariance(jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """s^2 (J^T J)^-1, s^2 = |r|^2 / (M - P). A column of zeros has infinite variance; where columns are parallel the
-    variances along the free direction are huge, not, as with a pseudo-inverse, nought."""
+    """s² (JᵀJ)⁻¹ (P, P) with s² = |r|² / (M - P). A column of zeros has infinite variance; if columns are parallel the
+    variances along the free direction are huge, not zero as with a pseudo-inverse."""
     size, count = jacobian.shape
     lengths = np.linalg.norm(jacobian, axis=0)
     seen = lengths > 0
-    found = np.diag(np.where(seen, 0.0, np.inf))
+    out = np.diag(np.where(seen, 0.0, np.inf))
     if seen.any():
         _, s, vh = np.linalg.svd(jacobian[:, seen] / lengths[seen], full_matrices=False)
         s = np.maximum(s, s[0] * max(size, count) * np.finfo(float).eps)
         inverse = (vh.T / s**2) @ vh / np.outer(lengths[seen], lengths[seen])
-        found[np.ix_(seen, seen)] = inverse * float(residual @ residual) / max(size - count, 1)
-    return found
+        out[np.ix_(seen, seen)] = inverse * float(residual @ residual) / max(size - count, 1)
+    return out
+
+
+def standard_errors(
+    parameters: Sequence[Parameter], values: Mapping[str, float], variances: np.ndarray
+) -> dict[str, float]:
+    """Of each parameter in its own unit, from ``variances`` (P,) in the fitted scales."""
+    return {
+        p.name: float(math.sqrt(v) * (abs(values[p.name]) if p.log else 1.0)) if math.isfinite(v) else math.inf
+        for p, v in zip(parameters, variances, strict=True)
+    }

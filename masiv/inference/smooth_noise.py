@@ -1,10 +1,10 @@
-"""How certain an estimate is whose errors are smooth in space and time.
+"""Noise that is smooth in space and time: its correlation lengths, and the covariance of estimates under it.
 
-Residuals that are fitted tell little of the noise where it looks like what was fitted: law and throw take over what is
-smooth over the body and the time. So the noise's lengths are those whose residual *after the same fit* would be
-correlated as the one that was found (moments in the sense of restricted maximum likelihood; Patterson and Thompson
-1971), and the covariance of an estimate is the sandwich A⁺ Σ A⁺ᵀ: a pattern as smooth as the noise is known less well
-than a rough one, which one effective number of samples cannot say.
+A fit absorbs the part of the noise that looks like what is fitted: law and initial state take over what is smooth over
+body and time. So the lengths are those whose residual *after the same fit* would be correlated as the given one
+(moments in the sense of restricted maximum likelihood; Patterson and Thompson 1971). The covariance of an estimate is
+the sandwich A⁺ Σ A⁺ᵀ: a pattern as smooth as the noise is known less well than a rough one, which one effective number
+of samples cannot say.
 """
 
 from __future__ import annotations
@@ -13,86 +13,89 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SAMPLE = 150
-"""Points from which lengths are estimated."""
-BINS = 12
-TIMES = tuple(0.3 * 1.25**k for k in range(16))
-"""Lengths in time that are tried, in instants."""
-PLACES = tuple(0.02 * 1.2**k for k in range(20))
-"""Lengths in space that are tried, over the largest distance of two points."""
-LEAST_INSTANTS, LEAST_POINTS = 4, 8
-AT_ONCE = 512
-"""Points whose covariance with all others is held at a time."""
+MAX_POINTS, DISTANCE_BINS = 150, 12
+"""Points, and bins of their distances, from which lengths are estimated."""
+TIME_LENGTHS = tuple(0.3 * 1.25**k for k in range(16))
+"""Correlation times that are tried, in instants."""
+RELATIVE_LENGTHS = tuple(0.02 * 1.2**k for k in range(20))
+"""Correlation lengths that are tried, over the largest distance of two points."""
+MIN_INSTANTS, MIN_POINTS = 4, 8
+"""Fewer than these do not tell how smooth a noise is."""
+BLOCK_POINTS = 512
+"""Points whose covariance with all others is held in memory at a time."""
 
 
 @dataclass(frozen=True)
-class Smoothness:
-    """A noise of ``variance`` [m^2] in each axis, correlated as exp(-(lag / instants)^2 / 2) in time and as
-    exp(-(distance / metres)^2 / 2) in space."""
+class SmoothNoise:
+    """A noise of ``variance`` [m²] in each axis, correlated as exp(-(lag / correlation_time)² / 2) in time [instants]
+    and as exp(-(distance / correlation_length)² / 2) in space [m]."""
 
     variance: float
-    time_count: float
-    metres: float
+    correlation_time: float
+    correlation_length: float
 
 
-def smoothness(field: np.ndarray, sensitivities: np.ndarray, positions: np.ndarray) -> Smoothness | None:
-    """Of the noise in ``field`` (K, N, A) [m], what a fit with ``sensitivities`` (K, N, A, P) left of it, of points
-    that lie at ``positions`` (N, 3) [m]. None where there are too few instants or points to tell."""
+def estimate_smooth_noise(field: np.ndarray, sensitivities: np.ndarray, positions: np.ndarray) -> SmoothNoise | None:
+    """The noise of which a fit with ``sensitivities`` (T, N, A, P) left the ``field`` (T, N, A) [m], of points at
+    ``positions`` (N, 3) [m]. None if there are too few instants or points to tell."""
     instants, count, axes = field.shape
-    if instants < LEAST_INSTANTS or count < LEAST_POINTS or not field.any():
+    if instants < MIN_INSTANTS or count < MIN_POINTS or not field.any():
         return None
-    coarse = np.sort(np.random.default_rng(0).choice(count, min(SAMPLE, count), replace=False))
-    apart = _apart(positions[coarse], positions[coarse])
-    size = float(apart.max())
+    chosen = np.sort(np.random.default_rng(0).choice(count, min(MAX_POINTS, count), replace=False))
+    distance = _distances(positions[chosen], positions[chosen])
+    size = float(distance.max())
     if size == 0.0:
         return None
-    some = field[:, coarse]
-    basis = basis_of(sensitivities[:, coarse].reshape(some.size, -1))
-    # The same fit, to these instants and points alone, so that what it left of them is known exactly.
+    some = field[:, chosen]
+    basis = basis_of(sensitivities[:, chosen].reshape(some.size, -1))
+    # The same fit to these instants and points alone, so that what it left of them is known exactly.
     left = some.ravel() - basis @ (basis.T @ some.ravel())
     shaped = basis.reshape(*some.shape, -1)
     lag = _lags(instants)
-    bins = np.digitize(apart, np.linspace(0, size, BINS + 1)[1:])
-    np.fill_diagonal(bins, BINS)  # of a point with itself, which the first time lag is
-    pairs = np.bincount(bins.ravel(), minlength=BINS + 1)[:BINS]
+    bins = np.digitize(distance, np.linspace(0, size, DISTANCE_BINS + 1)[1:])
+    np.fill_diagonal(bins, DISTANCE_BINS)  # of a point with itself, which the first time lag is
+    pairs = np.bincount(bins.ravel(), minlength=DISTANCE_BINS + 1)[:DISTANCE_BINS]
     seen = pairs > 0
 
     def moments(in_time: np.ndarray, in_space: np.ndarray) -> np.ndarray:
         """Means of products at each time lag, but the longest, and at each distance."""
-        times = np.bincount(lag.ravel(), in_time.ravel()) / (np.bincount(lag.ravel()) * len(coarse) * axes)
-        places = np.bincount(bins.ravel(), in_space.ravel(), minlength=BINS + 1)[:BINS] / np.maximum(pairs, 1)
+        times = np.bincount(lag.ravel(), in_time.ravel()) / (np.bincount(lag.ravel()) * len(chosen) * axes)
+        places = np.bincount(bins.ravel(), in_space.ravel(), minlength=DISTANCE_BINS + 1)[:DISTANCE_BINS] / np.maximum(
+            pairs, 1
+        )
         return np.concatenate([times[:-1], places[seen] / (instants * axes)])
 
-    found = moments(*_grams(left.reshape(*some.shape, 1), left.reshape(*some.shape, 1)))
+    measured = moments(*_grams(left.reshape(*some.shape, 1), left.reshape(*some.shape, 1)))
     weights = np.r_[np.full(instants - 2, 1 / (instants - 2)), np.full(int(seen.sum()), 1 / seen.sum())]
     best, least = None, np.inf
-    for metres in size * np.array(PLACES):
-        in_space = np.exp(-0.5 * (apart / metres) ** 2)
+    for metres in size * np.array(RELATIVE_LENGTHS):
+        in_space = np.exp(-0.5 * (distance / metres) ** 2)
         spread = np.tensordot(in_space, shaped, (1, 1)).swapaxes(0, 1)
-        for length in TIMES:
+        for length in TIME_LENGTHS:
             in_time = np.exp(-0.5 * (lag / length) ** 2)
             rows = np.tensordot(in_time, spread, (1, 0))
             core = basis.T @ rows.reshape(basis.shape)
             taken = shaped @ core - 2 * rows
-            expected = moments(in_time * len(coarse) * axes, in_space * instants * axes) + moments(
+            expected = moments(in_time * len(chosen) * axes, in_space * instants * axes) + moments(
                 *_grams(taken, shaped)
             )
             if expected[0] <= 0:
                 continue
-            misfit = float(weights @ ((expected / expected[0] - found / found[0])[1:] ** 2))
-            if misfit < least:
-                best, least = Smoothness(float(found[0] / expected[0]), length, float(metres)), misfit
+            mismatch = float(weights @ ((expected / expected[0] - measured / measured[0])[1:] ** 2))
+            if mismatch < least:
+                best, least = SmoothNoise(float(measured[0] / expected[0]), length, float(metres)), mismatch
     return best
 
 
-def covariance_of(estimator: np.ndarray, noise: Smoothness, positions: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Covariance (P, P) of ``estimator`` (K, N, A, P) times a noise, ``scale`` (K,) times as large at each instant."""
-    in_time = np.exp(-0.5 * (_lags(len(scale)) / noise.time_count) ** 2) * np.outer(scale, scale)
+def covariance_of(estimator: np.ndarray, noise: SmoothNoise, positions: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Covariance (P, P) of ``estimator`` (T, N, A, P) times a noise that is ``scale`` (T,) times as large at each
+    instant, of points at ``positions`` (N, 3) [m]."""
+    in_time = np.exp(-0.5 * (_lags(len(scale)) / noise.correlation_time) ** 2) * np.outer(scale, scale)
     later = np.tensordot(in_time, estimator, (1, 0))
     total = np.zeros((estimator.shape[-1],) * 2)
-    for begin in range(0, len(positions), AT_ONCE):
-        part = slice(begin, begin + AT_ONCE)
-        in_space = np.exp(-0.5 * (_apart(positions[part], positions) / noise.metres) ** 2)
+    for begin in range(0, len(positions), BLOCK_POINTS):
+        part = slice(begin, begin + BLOCK_POINTS)
+        in_space = np.exp(-0.5 * (_distances(positions[part], positions) / noise.correlation_length) ** 2)
         spread = np.tensordot(in_space, later, (1, 1)).swapaxes(0, 1)
         total += np.tensordot(estimator[:, part], spread, ((0, 1, 2), (0, 1, 2)))
     return noise.variance * total
@@ -117,5 +120,5 @@ def _lags(count: int) -> np.ndarray:
     return np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
 
 
-def _apart(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[:, None] - others[None], axis=2)

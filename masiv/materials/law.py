@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
@@ -13,6 +15,10 @@ from masiv.files import write_safetensors
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
     from masiv.kernels.substep import SubstepKernels
+
+L = TypeVar("L", bound="Law")
+MAX_KNOWN = 16
+"""Tensors that a frozen law remembers: tables for as many substeps, of about 0.1 MB each."""
 
 
 class BoundLaw(ABC):
@@ -28,7 +34,7 @@ class BoundLaw(ABC):
         mpm.p2g(s, count, nodes)
 
     def substeps(self, mpm: MpmKernels, serial: bool) -> SubstepKernels | None:
-        """Kernels of whole substeps with this law, ready to be launched; None where it has none, and on a GPU."""
+        """Kernels of whole substeps with this law, ready to be launched; None if it has none, and on a GPU."""
         return None
 
     @abstractmethod
@@ -86,6 +92,26 @@ class Law(torch.nn.Module, ABC):
     """
 
     kind: str
+    _known: dict[Hashable, torch.Tensor] | None = None
+
+    def frozen(self: L) -> L:
+        """A copy whose parameters need no gradient and must not change any more: what it computes from its parameters
+        alone (tables, coefficients), it computes once."""
+        law = copy.deepcopy(self).requires_grad_(False)
+        law._known = {}
+        return law
+
+    def once(self, key: Hashable, compute: Callable[[], torch.Tensor]) -> torch.Tensor:
+        """``compute()``, remembered under ``key`` by a frozen law."""
+        if self._known is None:
+            return compute()
+        value = self._known.pop(key, None)
+        if value is None:
+            value = compute()
+        self._known[key] = value  # the last, as the one used last
+        while len(self._known) > MAX_KNOWN:
+            del self._known[next(iter(self._known))]
+        return value
 
     @abstractmethod
     def project(self, trial_gradient: torch.Tensor, dt: float) -> torch.Tensor:
@@ -105,10 +131,10 @@ class Law(torch.nn.Module, ABC):
 
     @abstractmethod
     def description(self) -> dict[str, Any]:
-        """What ``twin.yaml`` says of the law: kind and readable parameters with units."""
+        """The law in ``twin.yaml``: kind, and parameters with units."""
 
     def file_metadata(self) -> dict[str, str]:
-        """What a file of this law needs besides its weights to be read again."""
+        """Metadata that a file of this law needs in addition to its weights."""
         return {"kind": self.kind}
 
     def save(self, path: Path) -> None:

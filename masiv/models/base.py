@@ -100,6 +100,25 @@ class Observation(Protocol):
         """Where the points are at the start (N, 3) [m]."""
         ...
 
+    @property
+    def times(self) -> np.ndarray:
+        """Of the instants (T,) [s]."""
+        ...
+
+    @property
+    def points_in_world(self) -> np.ndarray:
+        """``points`` in the world frame."""
+        ...
+
+    @property
+    def values_in_world(self) -> np.ndarray:
+        """What was measured (T, N, A) [m], in the world frame along A of its axes."""
+        ...
+
+    def field_in_world(self, field: np.ndarray) -> np.ndarray:
+        """A residual (T, N, A) [m] along axes of the world frame."""
+        ...
+
 
 class WeightedResidual:
     """A part of ``Observation``: residuals in proportion to what they say."""
@@ -118,7 +137,23 @@ class WholeRunSplit(WeightedResidual):
     """A part of ``Observation``: a run of which all or no instants are fitted."""
 
     times: np.ndarray
+    observed: np.ndarray
     fitted: bool
+
+    @property
+    def points(self) -> np.ndarray:
+        raise NotImplementedError
+
+    @property
+    def points_in_world(self) -> np.ndarray:
+        return self.points
+
+    @property
+    def values_in_world(self) -> np.ndarray:
+        return self.observed.reshape(len(self.observed), -1, self.observed.shape[-1])
+
+    def field_in_world(self, field: np.ndarray) -> np.ndarray:
+        return field
 
     @property
     def time_count(self) -> int:
@@ -161,8 +196,11 @@ class ForwardModel(Protocol):
     """Residuals of models over experiments, and the parameters of a model."""
 
     rollouts: int
-    observations: Sequence[Any]
-    """Of ``Observation``."""
+
+    @property
+    def observations(self) -> Sequence[Any]:
+        """Of ``Observation``."""
+        ...
 
     def with_observations(self: Self, observations: Sequence[Any]) -> Self:
         """A copy that compares with ``observations`` (the same, with another noise model or grid changes). It shares

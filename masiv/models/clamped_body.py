@@ -29,12 +29,12 @@ from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit
 from masiv.models.free_body import Model
 from masiv.models.marker_body import Plan, SimulatedBody, plan, simulated_body
 from masiv.models.parameters import Parameter
-from masiv.models.point_mass import outline_of
 from masiv.models.release import clamp_axes, fit_release
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import rollout
 from masiv.refine.config import RefineConfig
 from masiv.tracks.tracks import Run, Tracks
+from masiv.twin.from_tracks import drag_body
 
 RELEASE_REACH, RELEASE_STEP = 0.03, 1e-3
 OFFSET_REACH, OFFSET_STEP = 3e-3, 1e-4
@@ -47,7 +47,6 @@ DEFLECTION_REACH, DEFLECTION_STEP = 0.2, 0.01
 KEPT = 24
 LOST = 1.2
 """Residual over the swing about its mean from which the phase is lost; of two swings in step it is less than 1."""
-LEAST_SEEN = 0.5
 BESIDE = 0.15
 """How far from the body, in lengths of it, something that acts on it may be."""
 
@@ -107,22 +106,9 @@ def body_run(
 ) -> BodyRun:
     """``run`` from ``skip`` to ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises
     InputError."""
-    if not skip < duration:
-        raise InputError(f"run {run.name}: unsteady: {skip:g} s leaves nothing of tracks.duration {duration:g} s")
-    if run.release is None:
-        raise InputError(f"{tracks.path}: run {run.name}: nobody knows when it was let go: give rest_frames")
     body = simulated_body(tracks, run, config, particle_spacing=spacing)
-    cut = run.between(run.release + skip, run.release + duration)
     markers = list(body.markers)
-    whole = np.asarray(np.isfinite(cut.positions[:, markers]).all(axis=(1, 2)), bool)
-    if whole.mean() < LEAST_SEEN or whole.sum() < 6:
-        raise InputError(
-            f"{tracks.path}: run {run.name}: all of {', '.join(run.markers[m] for m in markers)} are seen in "
-            f"{int(whole.sum())} of {len(whole)} frames: leave out with markers those that are rarely seen"
-        )
-    observed = cut.positions[whole][:, markers]
-    times = cut.elapsed[whole]
-    speed = float(np.linalg.norm(np.diff(observed, axis=0), axis=2).max() / np.diff(times).min())
+    times, observed, speed = run.released(body.markers, skip, duration)
     noise = 1e-6 if run.noise_std is None else max(float(np.sqrt((run.noise_std[markers] ** 2).sum(1).mean())), 1e-6)
     residual_std = np.full(len(times), noise)
     return BodyRun(run.name, run.condition, times, observed, body, run.purpose == "fit", speed, noise, residual_std,
@@ -150,7 +136,7 @@ class BodySimulation(SharedRollouts):
         self.observations: Sequence[BodyRun] = tuple(runs)
         self.config = config
         self.known = dict(known or {})
-        self.outline: DragBody = outline_of(tracks, next(iter(tracks.bodies.values())))
+        self.outline: DragBody = drag_body(tracks, next(iter(tracks.bodies.values())))
         self.ground = tracks.ground is not None
         self.across = np.concatenate([np.linalg.svd(tracks.up[None])[2][1:], tracks.up[None]])
         """Two horizontal axes and the vertical one (3, 3), world."""

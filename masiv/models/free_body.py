@@ -74,6 +74,22 @@ class VideoObservation(WeightedResidual):
         """Particles at frame 0 (N, 3) [m, simulation frame]."""
         return self.problem.start.double().numpy()
 
+    @property
+    def times(self) -> np.ndarray:
+        """[s] since frame 0."""
+        return np.arange(1, self.time_count + 1) / (self.problem.samples * self.problem.scene.fps)
+
+    @property
+    def points_in_world(self) -> np.ndarray:
+        return self.problem.axes.points_to_world(self.points)
+
+    @property
+    def values_in_world(self) -> np.ndarray:
+        return self.problem.axes.points_to_world(self.problem.targets.double().numpy())
+
+    def field_in_world(self, field: np.ndarray) -> np.ndarray:
+        return self.problem.axes.vectors_to_world(field)
+
 
 @dataclass(frozen=True)
 class Model:

@@ -12,7 +12,7 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.context import EffectContext
-from masiv.errors import InputError, MasivError
+from masiv.errors import InputError
 from masiv.models.attachment import Attachment, attach
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
@@ -20,22 +20,14 @@ from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulator import Simulator
 from masiv.mpm.state import State
+from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame
-from masiv.tracks.geometry import Geometry
-from masiv.tracks.tracks import Run, Tracks
+from masiv.tracks.geometry import fill_geometry
+from masiv.tracks.placement import Placement
+from masiv.tracks.tracks import Clamp, Run, Tracks
 
 if TYPE_CHECKING:
     from masiv.materials.law import Law
-
-
-def fill_geometry(geometry: Geometry, spacing: float) -> np.ndarray:
-    """Particles (N, 3) [m, own axes] about ``spacing`` [m] apart: the middles of cells that divide the bounding box
-    evenly, where they are inside. Each stands for volume / N. Raises MasivError where fewer than 8 are."""
-    counts = np.maximum(np.rint((geometry.upper - geometry.lower) / spacing).astype(int), 1)
-    centres, inside = geometry.lattice_inside(counts)
-    if inside.sum() < 8:
-        raise MasivError(f"the body is thinner than the particle spacing {1e3 * spacing:.2g} mm: choose a smaller one")
-    return centres[inside]
 
 
 @dataclass(frozen=True)
@@ -96,48 +88,76 @@ class SimulatedBody:
 def simulated_body(
     tracks: Tracks, run: Run, config: SimulatorConfig, *, particle_spacing: float, contact: str = "sticky"
 ) -> SimulatedBody:
-    """The body of ``run`` filled with particles ``particle_spacing`` [m] apart, at its place in that run.
-
-    The grid holds ``config.particles_per_cell`` of them a cell. Without a ground it runs along the body's own axes, a
-    plane of its nodes in each face of the clamp's first plane, so that neither is blurred. Raises InputError where the
-    scene does not say what is needed.
-    """
+    """The body of ``run`` filled with particles ``particle_spacing`` [m] apart, see ``placed_body``. Raises InputError
+    if the scene does not say what is needed."""
     body = tracks.bodies[run.body]
     if body.geometry is None or body.density is None or run.placement is None:
         raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass, to be simulated")
-    own = fill_geometry(body.geometry, particle_spacing)
-    spacing = grid_spacing(body.geometry.volume, len(own), config)
-    placement = run.placement
-    if tracks.ground is None:
-        frame = _along_body(placement.rotation, tracks.up)
-    else:
-        frame = SimulationFrame.from_scene(tracks.up, tracks.ground)
-    normals, heights = np.zeros((0, 3)), np.zeros(0)
-    if body.clamp is not None:
-        in_world = body.clamp.normals @ placement.rotation.T
-        heights = body.clamp.heights + in_world @ placement.translation
-        normals = frame.vectors_to_simulation(in_world)
-        heights = heights + normals @ frame.translation
-    if tracks.ground is None:
-        frame, heights = _on_nodes(frame, placement.to_world(own), normals, heights, spacing)
-    particles = frame.points_to_simulation(placement.to_world(own))
-    held = body.clamp.markers if body.clamp is not None else ()
-    free = tuple(m for m, name in enumerate(run.markers) if name not in held and np.isfinite(run.at_rest[m]).all())
+    free = body.free_markers(run)
     if not free:
         raise InputError(f"run {run.name}: no marker with all three axes moves with the material")
-    attachment = attach(particles, frame.points_to_simulation(run.at_rest[list(free)]), particle_spacing)
+    return placed_body(
+        fill_geometry(body.geometry, particle_spacing),
+        body.geometry.volume,
+        body.density,
+        config,
+        particle_spacing=particle_spacing,
+        placement=run.placement,
+        clamp=body.clamp,
+        at_rest=run.at_rest[list(free)],
+        markers=free,
+        up=tracks.up,
+        gravity=tracks.gravity,
+        ground=tracks.ground,
+        contact=contact if tracks.ground is not None else "none",
+    )
+
+
+def placed_body(
+    own: np.ndarray,
+    volume: float,
+    density: float,
+    config: SimulatorConfig,
+    *,
+    particle_spacing: float,
+    placement: Placement,
+    clamp: Clamp | None,
+    at_rest: np.ndarray,
+    markers: tuple[int, ...],
+    up: np.ndarray,
+    gravity: np.ndarray,
+    ground: Ground | None,
+    contact: str,
+) -> SimulatedBody:
+    """Particles ``own`` (N, 3) [m, own axes], ``particle_spacing`` [m] apart, at a place in the world, and markers tied
+    to them that are ``at_rest`` (M, 3) [m, world]. up (3,) and gravity (3,) [m/s^2]: world.
+
+    The grid holds ``config.particles_per_cell`` of them a cell. Without a ground it runs along the body's own axes, a
+    plane of its nodes in each face of the clamp's first plane, so that neither is blurred.
+    """
+    spacing = grid_spacing(volume, len(own), config)
+    frame = _along_body(placement.rotation, up) if ground is None else SimulationFrame.from_scene(up, ground)
+    normals, heights = np.zeros((0, 3)), np.zeros(0)
+    if clamp is not None:
+        in_world = clamp.normals @ placement.rotation.T
+        heights = clamp.heights + in_world @ placement.translation
+        normals = frame.vectors_to_simulation(in_world)
+        heights = heights + normals @ frame.translation
+    if ground is None:
+        frame, heights = _on_nodes(frame, placement.to_world(own), normals, heights, spacing)
+    particles = frame.points_to_simulation(placement.to_world(own))
     return SimulatedBody(
         particles=torch.as_tensor(particles),
-        volume=body.geometry.volume,
-        density=body.density,
+        volume=volume,
+        density=density,
         spacing=spacing,
         frame=frame,
-        gravity=frame.vectors_to_simulation(tracks.gravity),
-        contact=contact if tracks.ground is not None else "none",
+        gravity=frame.vectors_to_simulation(gravity),
+        contact=contact,
         normals=torch.as_tensor(normals),
         heights=torch.as_tensor(heights),
-        attachment=attachment,
-        markers=free,
+        attachment=attach(particles, frame.points_to_simulation(at_rest), particle_spacing),
+        markers=markers,
     )
 
 

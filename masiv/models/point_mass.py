@@ -27,8 +27,8 @@ from masiv.models.free_body import Model
 from masiv.models.parameters import Parameter
 from masiv.refine.config import RefineConfig
 from masiv.scene.transforms import SimulationFrame
-from masiv.tracks.geometry import Geometry
-from masiv.tracks.tracks import Body, Run, Tracks
+from masiv.tracks.tracks import Run, Tracks
+from masiv.twin.from_tracks import drag_body
 
 RIGID = Family("rigid", (), {})
 """The law of a body that does not deform: nothing to fit."""
@@ -98,7 +98,7 @@ def _point_run(tracks: Tracks, run: Run) -> PointRun:
     if seen.sum() < 6:
         raise InputError(f"{tracks.path}: run {run.name} has {int(seen.sum())} frames in flight: it needs 6 or more")
     times = moving.times[seen]
-    outline = outline_of(tracks, body)
+    outline = drag_body(tracks, body)
     observed = moving.positions[seen][:, 0, list(axes)]
     times = times - times[0]
     noise = flight_noise(times, observed)
@@ -114,23 +114,6 @@ def flight_noise(times: np.ndarray, observed: np.ndarray) -> float:
     basis = np.polynomial.chebyshev.chebvander(2 * times / times[-1] - 1, SMOOTH)
     left = observed - basis @ np.linalg.lstsq(basis, observed, rcond=None)[0]
     return max(math.sqrt(float((left**2).sum()) / (len(times) - SMOOTH - 1)), 1e-6)
-
-
-def outline_of(tracks: Tracks, body: Body) -> DragBody:
-    """What the medium sees of a body. Raises InputError where its geometry or mass is not known."""
-    if body.geometry is None or body.mass is None:
-        raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass")
-    return DragBody(mean_diameter(body.geometry), body.mass, tracks.medium_density, tracks.medium_viscosity)
-
-
-def mean_diameter(geometry: Geometry) -> float:
-    """Of the sphere [m] with the frontal area that a convex body shows on the average, a quarter of its surface (Cauchy
-    1841); a sphere's own."""
-    if geometry.kind == "sphere":
-        return geometry.size
-    a, b, c = (geometry.vertices[geometry.faces[:, k]] for k in range(3))
-    surface = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    return math.sqrt(surface / math.pi)
 
 
 class PointSimulation(SharedRollouts):
@@ -251,21 +234,10 @@ class PointSimulation(SharedRollouts):
         world = np.zeros((len(starts), 2, 3))
         for k, axis in enumerate(run.axes):
             world[:, :, axis] = starts[:, 2 * k : 2 * k + 2]
-        begin = np.concatenate(
-            [self.frame.points_to_simulation(world[:, 0]), self.frame.vectors_to_simulation(world[:, 1])], axis=1
-        )
-        gaps = np.diff(run.times, prepend=run.times[0])
-        counts = np.maximum(np.ceil(gaps / self.substep), 1).astype(np.int32)
-        out = np.zeros((len(starts), len(run.times), 3))
-        coefficients = np.concatenate([c for _, c in members] or [np.zeros(1)])
-        kernels = point_kernels(tuple((effect, len(c)) for effect, c in members))
-        kernels.fly(
-            np.ascontiguousarray(begin), np.ascontiguousarray(self.gravity, dtype=np.float64),
-            np.tile(coefficients, (len(starts), 1)), run.times.astype(np.float64), counts, run.outline.diameter, out,
-        )  # fmt: skip
-        if not np.isfinite(out).all():
+        paths = fly(self.frame, self.gravity, members, world, run.times, run.outline.diameter, self.substep)
+        if not np.isfinite(paths).all():
             raise NonFiniteError(0, 0, f"the flight of {run.name} is not finite")
-        return self.frame.points_to_world(out)[:, :, list(run.axes)]
+        return paths[:, :, list(run.axes)]
 
     def start_of(self, run: PointRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Place and velocity (2A,) at the first frame: among ``values``, or for a held-out run those nearest to it."""
@@ -337,8 +309,37 @@ class PointSimulation(SharedRollouts):
         out = [f"{b}: {why}" for b in term.bodies or self.bodies if (why := self._contradiction(after, term, b))]
         for body in old:
             share = 1 - new[body] / old[body]
-            if term.bodies == (body,) and share < config.least_gain:
+            if term.bodies == (body,) and share < config.min_gain:
                 out.append(f"{body}: {old[body]:.0f} mm held out become {new[body]:.0f} mm")
-            elif share < -config.least_gain:
+            elif share < -config.min_gain:
                 out.append(f"{body} does not share it: {old[body]:.0f} mm held out become {new[body]:.0f} mm")
         return out
+
+
+def fly(
+    frame: SimulationFrame,
+    gravity: np.ndarray,
+    members: list[tuple[Effect, np.ndarray]],
+    starts: np.ndarray,
+    times: np.ndarray,
+    diameter: float,
+    substep: float = LONGEST_SUBSTEP,
+) -> np.ndarray:
+    """Places (B, K, 3) [m, world] of a mass point at ``times`` (K,) [s], the first of which is the start.
+
+    starts (B, 2, 3): place [m] and velocity [m/s], world; gravity (3,) [m/s^2, simulation frame]; members: effects with
+    their coefficients; diameter [m]; substep [s]: an upper bound.
+    """
+    begin = np.concatenate(
+        [frame.points_to_simulation(starts[:, 0]), frame.vectors_to_simulation(starts[:, 1])], axis=1
+    )
+    gaps = np.diff(times, prepend=times[0])
+    counts = np.maximum(np.ceil(gaps / substep), 1).astype(np.int32)
+    out = np.zeros((len(starts), len(times), 3))
+    coefficients = np.concatenate([c for _, c in members] or [np.zeros(1)])
+    kernels = point_kernels(tuple((effect, len(c)) for effect, c in members))
+    kernels.fly(
+        np.ascontiguousarray(begin), np.ascontiguousarray(gravity, dtype=np.float64),
+        np.tile(coefficients, (len(starts), 1)), times.astype(np.float64), counts, diameter, out,
+    )  # fmt: skip
+    return frame.points_to_world(out)

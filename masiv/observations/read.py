@@ -1,58 +1,50 @@
-"""The one way in: ``read_scene``."""
+"""Read an observation, whatever its layout: ``read_observation``, or ``read_scene`` for video only."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
 from masiv.errors import InputError
 from masiv.scene import blender, nerfstudio, pacnerf, springgaus_real, springgaus_synthetic
-from masiv.scene.declaration import SceneDeclaration, read_declaration
+from masiv.scene.layout import Layout
 from masiv.scene.scene import Scene
-from masiv.tracks import read as tracks_layout
+from masiv.tracks import read as tracks
 from masiv.tracks.tracks import Tracks
 
-
-class Layout(Protocol):
-    """A module that reads one layout. ``LOOKED_FOR`` says by which files it is known."""
-
-    @property
-    def LOOKED_FOR(self) -> str: ...
-
-    def recognises(self, folder: Path, /) -> bool: ...
-
-    def read(self, folder: Path, declaration: SceneDeclaration, /) -> Scene: ...
-
-
-LAYOUTS: dict[str, Layout] = {
-    "PAC-NeRF": pacnerf,
-    "Spring-Gaus synthetic": springgaus_synthetic,
-    "Spring-Gaus real": springgaus_real,
-    "nerfstudio": nerfstudio,
-    "Blender": blender,
-}
+LAYOUTS: tuple[Layout[Scene | Tracks], ...] = (
+    tracks.LAYOUT,
+    pacnerf.LAYOUT,
+    springgaus_synthetic.LAYOUT,
+    springgaus_real.LAYOUT,
+    nerfstudio.LAYOUT,
+    blender.LAYOUT,
+)
+"""All layouts, in the order in which they are tried."""
 
 
 def read_observation(path: str | Path) -> Scene | Tracks:
-    """Read what is at ``path``: pictures or tracks. Errors as of ``read_scene``."""
-    folder = Path(path)
-    return tracks_layout.read_tracks(folder) if tracks_layout.recognises(folder) else read_scene(folder)
+    """Read the video or the tracks at ``path``, with the ``scene.yaml`` next to the data.
+
+    Raises InputError if no layout is recognized or the data cannot be used. Lesser defects are in ``problems``.
+
+    Example:
+        >>> read_observation("scenes/beam").layout  # doctest: +SKIP
+        'tracks'
+    """
+    path = Path(path)
+    for layout in LAYOUTS:
+        if layout.can_read(path):
+            return layout.read(path)
+    if not path.is_dir():
+        raise InputError(f"{path} is not a folder: give the folder of a scene")
+    known = "; ".join(f"{layout.files} ({layout.name})" for layout in LAYOUTS)
+    raise InputError(f"{path} has no known scene layout: looked for {known}")
 
 
 def read_scene(path: str | Path) -> Scene:
-    """Read the scene of pictures at ``path``, whatever its layout, with the ``scene.yaml`` beside it.
-
-    Raises InputError where nothing is recognised or what is there cannot be used; lesser troubles are in ``problems``.
-    """
-    path = Path(path)
-    if tracks_layout.recognises(path):
+    """Read the video at ``path``. Raises InputError as ``read_observation`` does, and for a scene of tracks."""
+    if tracks.LAYOUT.can_read(Path(path)):
         raise InputError(f"{path} is a scene of tracks: this needs one of pictures")
-    is_sequence = path.is_file() and springgaus_real.recognises(path)
-    if not path.is_dir() and not is_sequence:
-        raise InputError(f"{path} is not a folder: give the folder of a scene")
-    for layout in LAYOUTS.values():
-        if layout.recognises(path):
-            return layout.read(path, read_declaration(path.parent if is_sequence else path))
-    known = {**LAYOUTS, "tracks": tracks_layout}
-    looked = "; ".join(f"{layout.LOOKED_FOR} ({name})" for name, layout in known.items())
-    raise InputError(f"{path} has no known scene layout: looked for {looked}")
+    scene = read_observation(path)
+    assert isinstance(scene, Scene)
+    return scene

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
-from masiv.files import write_json, write_npz, write_yaml
+from masiv.files import write_json
 from masiv.pipeline import stages
 from masiv.pipeline.requests import RefineRequest, Summary
 from masiv.progress import Progress
@@ -20,25 +17,24 @@ from masiv.scene.scene import Scene
 
 if TYPE_CHECKING:
     from masiv.pipeline.video import VideoRun
-    from masiv.refine.stage import Refined, Throw
+    from masiv.refine.from_video import Recording
+    from masiv.refine.result import RefineResult
     from masiv.splat.dynamic import DynamicGaussians
     from masiv.twin import Twin
-
-BEFORE = "twin.before.yaml"
-LAW_BEFORE = "law.before.safetensors"
 
 
 def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Progress) -> Summary:
     """Refine the first of ``runs`` jointly with the others; writes refine.json, refine.npz, the report and, if an
     effect is accepted, the new twin and what it gives."""
-    from masiv.refine.stage import refine
-    from masiv.refine.summary import text
+    from masiv.refine.document import text
+    from masiv.refine.from_video import refine_recordings
+    from masiv.twin.identified import load_identified
 
     first = runs[0]
     recordings = [recording_of(run, progress) for run in runs]
-    twin = load_identified_twin(first.path)
+    twin = load_identified(first.path)
     checkpoint = first.folder.checkpoint("refine")
-    result = refine(
+    result = refine_recordings(
         recordings,
         first.config.identify,
         first.config.simulator,
@@ -53,37 +49,32 @@ def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Prog
     return Summary({"refine": str(first.path / "refine.json"), **document}, text(document))
 
 
-def recording_of(run: VideoRun, progress: Progress) -> Throw:
+def recording_of(run: VideoRun, progress: Progress) -> Recording:
     """The motion of a run: fitted frames, and held-out frames measured in a pass of their own."""
-    from masiv.refine.stage import Throw, split_frames
+    from masiv.refine.from_video import Recording, split_frames
 
     trajectory = stages.load_trajectory(run.folder)
     held_out = stages.ensure_held_out_trajectory(run.folder, run.config, run.scene, progress)
     fitted = split_frames(run.scene.frame_count, run.folder.fit_frames)
-    return Throw(run.path.resolve().name, run.scene, trajectory, held_out or trajectory, fitted)
-
-
-def load_identified_twin(run: Path) -> Twin:
-    """The twin that identify made, without effects that refine added: refining again starts from it."""
-    from masiv.twin import Twin
-
-    return Twin.load(run, BEFORE if (run / BEFORE).is_file() else "twin.yaml")
+    return Recording(run.path.resolve().name, run.scene, trajectory, held_out or trajectory, fitted)
 
 
 def _save(
-    run: VideoRun, recording: Throw, result: Refined, twin: Twin, request: RefineRequest, progress: Progress
+    run: VideoRun, recording: Recording, result: RefineResult, twin: Twin, request: RefineRequest, progress: Progress
 ) -> dict[str, Any]:
-    from masiv.refine.stage import twin_of
-    from masiv.refine.summary import summary
-    from masiv.simulation.simulate import Rollout, simulate
+    from masiv.refine.document import document as document_of
+    from masiv.refine.document import save_arrays
+    from masiv.refine.to_twin import baseline_twin, refined_twin
+    from masiv.simulation.rollout import Rollout
+    from masiv.simulation.simulate import simulate
+    from masiv.twin.identified import IDENTIFIED_FILE, restore_identified, save_refined
 
     folder, scene = run.folder, run.scene
-    document = summary(result, run.config.refine, dry_run=request.dry_run)
-    changed = bool(document["accepted"] or document["stop_gap"]) and not request.dry_run
-    new = twin_of(result.result.gap or result.result.after, recording, result.simulation, twin)
-    if request.relearn and changed:
+    document = document_of(result)
+    old = baseline_twin(twin, result)
+    new = refined_twin(twin, result) if result.changes_twin else old
+    if request.relearn and result.changes_twin:
         new = _relearn(run, new, progress)
-    old = twin_of(result.result.before, recording, result.simulation, twin)
     dynamic = stages.load_gaussians(folder)
     rollouts = {
         name: simulate(model, frames=scene.frame_count, fps=scene.fps, progress=progress).positions
@@ -95,16 +86,14 @@ def _save(
     if request.dry_run:
         write_json(folder.path / "refine.dry_run.json", document)
         return document
-    _save_fields(folder.path / "refine.npz", result)
-    if changed:
-        _keep_identified_twin(folder.path)
+    save_arrays(folder.path / "refine.npz", result)
+    if result.changes_twin:
         _delete_artefacts_of_twin(folder)
-        new.save(folder.path)
+        save_refined(folder.path, new)
         Rollout(rollouts["after"], scene.times).save(folder.rollout)
-    elif (folder.path / BEFORE).is_file():  # an earlier refine had accepted something that this one does not
+    elif (folder.path / IDENTIFIED_FILE).is_file():  # an earlier refine had accepted something that this one does not
         _delete_artefacts_of_twin(folder)
-        twin.save(folder.path)
-        (folder.path / BEFORE).unlink()
+        restore_identified(folder.path)
     write_json(folder.path / "refine.json", document)
     _report(folder, scene, dynamic, progress)
     return document
@@ -129,7 +118,7 @@ def _relearn(run: VideoRun, twin: Twin, progress: Progress) -> Twin:
 
 def _delete_artefacts_of_twin(run: RunFolder) -> None:
     """Delete what describes a twin that is about to change, so that a killed run holds nothing outdated."""
-    from masiv.report.material import MATERIAL
+    from masiv.report.sections.material import MATERIAL
 
     for path in (run.rollout, run.metrics, run.path / MATERIAL):
         path.unlink(missing_ok=True)
@@ -137,9 +126,9 @@ def _delete_artefacts_of_twin(run: RunFolder) -> None:
 
 def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: Progress) -> None:
     """Write report.html, and before it what the run lacks of rollout, material.json and metrics.json."""
-    from masiv.report.material import MATERIAL
     from masiv.report.numbers import material_numbers, run_numbers
-    from masiv.report.report import write_report
+    from masiv.report.sections.material import MATERIAL
+    from masiv.report.video import write_report
     from masiv.simulation.simulate import simulate
     from masiv.twin import Twin
 
@@ -159,7 +148,7 @@ def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: P
 
 
 def _picture_errors(
-    scene: Scene, dynamic: DynamicGaussians, positions: np.ndarray, recording: Throw, progress: Progress
+    scene: Scene, dynamic: DynamicGaussians, positions: np.ndarray, recording: Recording, progress: Progress
 ) -> dict[str, dict[str, Any]]:
     """Chamfer to the observed motion, and pictures against the video, over fitted and held-out frames."""
     from masiv import metrics
@@ -170,8 +159,8 @@ def _picture_errors(
     views = list(range(len(scene.cameras)))
     out: dict[str, dict[str, Any]] = {}
     for split, frames in (
-        ("fit", list(range(1, recording.fitted))),
-        ("held_out", list(range(recording.fitted, scene.frame_count))),
+        ("fit", list(range(1, recording.fit_frames))),
+        ("held_out", list(range(recording.fit_frames, scene.frame_count))),
     ):
         if not frames:
             continue
@@ -181,28 +170,3 @@ def _picture_errors(
         out[split] = {"frames": frames, "chamfer_1e3mm2": float(np.mean(chamfer)), **kept}
         progress("refine: pictures", 1 if split == "fit" else 2, 2)
     return out
-
-
-def _save_fields(path: Path, result: Refined) -> None:
-    """Residuals of the first recording (K, N, 3) [m, world], simulated less observed; points and times."""
-    observation = result.simulation.observations[0]
-    problem = observation.problem
-    turn = problem.axes.vectors_to_world
-    write_npz(
-        path,
-        before=turn(result.before[0]).astype(np.float32),
-        after=turn(result.after[0]).astype(np.float32),
-        positions=problem.axes.points_to_world(problem.start.double().numpy()).astype(np.float32),
-        times=np.arange(1, len(result.before[0]) + 1) / (problem.samples * problem.scene.fps),
-        fitted=observation.fit_count,
-    )
-
-
-def _keep_identified_twin(run: Path) -> None:
-    """Keep twin.yaml as identify made it. A second refine keeps the first one's copy."""
-    if (run / BEFORE).is_file():
-        return
-    shutil.copyfile(run / "law.safetensors", run / LAW_BEFORE)
-    document = yaml.safe_load((run / "twin.yaml").read_text(encoding="utf-8"))
-    document["law"]["file"] = LAW_BEFORE
-    write_yaml(run / BEFORE, document)

@@ -76,9 +76,9 @@ def open_run(
     scene: Path, out: Path | None = None, overrides: Overrides | None = None, request: SceneRequest | None = None
 ) -> Run:
     """The run of ``scene`` in the folder ``out`` (runs/SCENE if None), new or resumed. Raises InputError."""
-    from masiv.tracks.read import recognises
+    from masiv.tracks.read import can_read
 
-    kind = _kinds()["tracks" if scene.is_dir() and recognises(scene) else "video"]
+    kind = _kinds()["tracks" if can_read(scene) else "video"]
     folder = out or Path("runs") / scene.resolve().name
     return kind.open(scene, folder, overrides or Overrides(), request or SceneRequest())
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from masiv.config import Config
 from masiv.errors import InputError
-from masiv.files import write_json
+from masiv.files import write_json, write_npz
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
 from masiv.pipeline.run import Run, settings
 from masiv.progress import Progress, silent
@@ -24,11 +23,10 @@ from masiv.tracks.tracks import Tracks
 if TYPE_CHECKING:
     import numpy as np
 
-    from masiv.tracks.twin import TracksTwin
+    from masiv.twin import Twin
 
-BEFORE = "twin.before.yaml"
 NOT_FOR_TRACKS = (
-    *("velocity", "omega", "law", "blend", "geometry", "density", "ground"),
+    *("omega", "law", "blend", "geometry", "density", "ground"),
     *("force", "force_from", "force_until", "render", "view"),
 )
 """Fields of ``SimulateRequest`` that apply to a filmed body alone."""
@@ -65,13 +63,12 @@ class TracksRun(Run):
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
-        from masiv.refine.tracks_stage import identify_tracks
+        from masiv.identify.from_tracks import identify_tracks
         from masiv.report.numbers import given_or_error
-        from masiv.tracks.twin import TracksTwin
 
         families: list[dict[str, Any]] = []
         if self.folder.done("identify"):
-            twin = TracksTwin.load(self.path)
+            twin = self._load_twin()
         else:
             with self.folder.stage("identify"):
                 twin, fits = identify_tracks(self.tracks, self.config, folder=self._rollout_cache, progress=progress)
@@ -81,79 +78,69 @@ class TracksRun(Run):
                 ]
                 twin.save(self.path)
         rows = self._report(twin, progress)
-        law = {
-            "kind": twin.law,
-            "parameters": {n: {"value": v, "unit": u, "stderr": e} for n, (v, u, e) in twin.parameters.items()},
-        }
+        law = law_entry(twin)
         data = {
             "run": str(self.path), "report": str(self.folder.report), "law": law, "families": families, "runs": rows
         }  # fmt: skip
-        lines = [f"law      {twin.law}"]
-        for name, (value, unit, error) in twin.parameters.items():
-            lines.append(f"         {name.replace('_', ' ')} {value:.4g} {unit}" + given_or_error(error))
+        lines = [f"law      {law['kind']}"]
+        for name, row in law["parameters"].items():
+            error = given_or_error(row["stderr"])
+            lines.append(f"         {name.replace('_', ' ')} {row['value']:.4g} {row['unit']}" + error)
         return Summary(data, "\n".join([*lines, *_table(rows), f"report   {self.folder.report}"]))
 
     def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:
         refuse(request, ("second_run", "relearn"), "pictures", self.folder.scene_path)
         self.folder.require("identify")
         self.start()
-        from masiv.refine.summary import ADDED, text
-        from masiv.refine.tracks_document import document, named, save_fields
-        from masiv.refine.tracks_stage import refine_tracks, twin_after
+        from masiv.refine.document import document, save_arrays, text
+        from masiv.refine.from_tracks import refine_tracks
+        from masiv.refine.to_twin import refined_twin
+        from masiv.twin.identified import load_to_refine, save_refined
 
         first = self._conditions[0]
-        twin = self._twin_without(request.condition or first)
-        if request.group and twin.group is None:
+        twin = load_to_refine(self.path, request.condition, self._described_twin)
+        if request.group and not twin.rigid:
             raise InputError(f"{self.path} is of one body: --group is for bodies that fly free and share physics")
         result = refine_tracks(
             self.tracks, twin, self.config, condition=request.condition, dry_run=request.dry_run,
             folder=self._rollout_cache, progress=progress,
         )  # fmt: skip
-        written = document(result, self.config.refine, dry_run=request.dry_run)
+        written = document(result)
         stem = refine_stem(request.condition, first)
         if request.dry_run:
             write_json(self.path / f"{stem}.dry_run.json", written)
         else:
             write_json(self.path / f"{stem}.json", written)
-            save_fields(self.path / f"{stem}.npz", result)
-            if written["verdict"] == ADDED:
-                self._keep_identified_twin()
-                twin = twin_after(twin, result)
-            twin.save(self.path)
+            save_arrays(self.path / f"{stem}.npz", result)
+            if result.changes_twin:
+                twin = refined_twin(twin, result)
+                save_refined(self.path, twin, self._described_twin)
+            else:
+                twin.save(self.path)
             self._report(twin, progress)
         if self._rollout_cache.is_dir():
             shutil.rmtree(self._rollout_cache)
-        lines = [text(named(written))]
-        for body, row in written["bodies"].items():
-            held = row["held_out_mm"]
-            what = ", ".join(row["effects"]) or row["verdict"]
-            lines.append(f"  {body:24s} {what:28s} held out {held['before']:.0f} -> {held['after']:.0f} mm")
-        for row in written["shared"]:
-            lines.append(
-                f"one {row['parameter'].replace('_', ' ')} for {', '.join(row['bodies'])}: {row['value']:.3g} ± "
-                f"{row['stderr']:.2g} {row['unit']}, {row['spread_between_bodies']:.2g} between them"
-            )
-        return Summary({"refine": str(self.path / f"{stem}.json"), **written}, "\n".join(lines))
+        return Summary({"refine": str(self.path / f"{stem}.json"), **written}, text(written))
 
     def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
         refuse(request, NOT_FOR_TRACKS, "pictures", self.folder.scene_path)
         self.folder.require("identify")
         self.start()
-        from masiv.simulation.tracks import save_rollout, simulate_tracks
-        from masiv.tracks.twin import TracksTwin
+        from masiv.simulation.simulate import simulate
 
-        twin = TracksTwin.load(self.path)
-        arrays = simulate_tracks(
-            self.tracks, twin, self.config, frames=request.frames, gravity=request.gravity, without=request.without,
-            condition=request.condition,
+        twin = self._load_twin()
+        rollout = simulate(
+            twin, frames=request.frames, velocity=request.velocity, gravity=request.gravity, without=request.without,
+            condition=request.condition, progress=progress,
         )  # fmt: skip
-        path = save_rollout(out, arrays)
+        path = out / "rollout.npz"
+        rollout.save(path)
         data = {
             "rollout": str(path),
             "frames": request.frames,
-            "particles": arrays["positions"].shape[1],
-            "markers": arrays["marker_names"].tolist(),
-            "effects": [e.effect for e in twin.effects if e.effect not in request.without],
+            "particles": rollout.positions.shape[1],
+            "markers": list(rollout.marker_names),
+            "effects": [e.name for e in twin.effects if e.name not in request.without],
         }
         return Summary(data, str(path))
 
@@ -163,9 +150,7 @@ class TracksRun(Run):
             raise InputError(f"--truth is for scenes of pictures: leave it out for {self.folder.scene_path}")
         self.folder.require("identify")
         self.start()
-        from masiv.tracks.twin import TracksTwin
-
-        rows = self._report(TracksTwin.load(self.path), progress)
+        rows = self._report(self._load_twin(), progress)
         numbers = {
             "fit": [r for r in rows if r["use"] == "fit"],
             "held_out": [r for r in rows if r["use"] == "hold_out"],
@@ -184,36 +169,28 @@ class TracksRun(Run):
     def _conditions(self) -> list[str]:
         return list(dict.fromkeys(run.condition for run in self.tracks.runs))
 
-    def _twin_without(self, condition: str) -> TracksTwin:
-        """The twin from which ``condition`` is refined: without what an earlier refine of it added. The first condition
-        begins with the law that identify found; effects of other conditions stay."""
-        from masiv.tracks.twin import TracksTwin
+    def _load_twin(self) -> Twin:
+        from masiv.twin import Twin
 
-        current = TracksTwin.load(self.path)
-        if condition != self._conditions[0]:
-            return replace(current, effects=tuple(e for e in current.effects if e.condition != condition))
-        identified = TracksTwin.load(self.path, BEFORE) if (self.path / BEFORE).is_file() else current
-        others = tuple(e for e in current.effects if e.condition is not None)
-        return replace(identified, effects=others, starts={**current.starts, **identified.starts})
+        return Twin.load(self.path, scene=self._described_twin)
 
-    def _keep_identified_twin(self) -> None:
-        """Keep twin.yaml as identify made it. A second refine keeps the first one's copy."""
-        if not (self.path / BEFORE).is_file():
-            shutil.copyfile(self.path / "twin.yaml", self.path / BEFORE)
+    def _described_twin(self) -> Twin:
+        from masiv.identify.from_tracks import described_twin
 
-    def _report(self, twin: TracksTwin, progress: Progress) -> list[dict[str, Any]]:
+        return described_twin(self.tracks, self.config)
+
+    def _report(self, twin: Twin, progress: Progress) -> list[dict[str, Any]]:
         """Simulate every run with the twin, and with the one before refine if there is one; metrics.json, rollout.npz,
         report.html. Returns the errors of each run."""
-        from masiv.refine.tracks_document import named, observed_of
-        from masiv.refine.tracks_stage import run_errors, simulated
-        from masiv.report.tracks_page import write_page
-        from masiv.simulation.tracks import save_rollout
-        from masiv.tracks.twin import TracksTwin
+        from masiv.identify.twin_over_runs import run_errors, simulated
+        from masiv.refine.document import with_scopes
+        from masiv.report.tracks import write_report
+        from masiv.twin.identified import IDENTIFIED_FILE, load_identified
 
         twins = {"before": twin}
-        if (self.path / BEFORE).is_file():
-            twins = {"before": TracksTwin.load(self.path, BEFORE), "after": twin}
-        conditions: list[str | None] = [None] if twin.group is not None else list(self._conditions)
+        if (self.path / IDENTIFIED_FILE).is_file():
+            twins = {"before": load_identified(self.path, self._described_twin), "after": twin}
+        conditions: list[str | None] = [None] if twin.rigid else list(self._conditions)
         rows: dict[str, dict[str, Any]] = {}
         curves: dict[str, dict[str, np.ndarray]] = {}
         for done, condition in enumerate(conditions):
@@ -224,29 +201,42 @@ class TracksRun(Run):
                 made = simulated(self.tracks, model, self.config, condition)
                 observations, fields = made.simulation.observations, made.fields()
                 for observation, field in zip(observations, fields, strict=True):
-                    observed = observed_of(observation)
+                    observed = observation.values_in_world
                     own = curves.setdefault(observation.name, {"times": observation.times, "observed": observed})
                     own[name] = observed + field
                 for row in run_errors(observations, fields):
                     error = row.pop("rmse_mm")
                     rows.setdefault(row["run"], row)[f"{name}_mm"] = error
         progress("report: simulate", len(conditions), len(conditions))
-        save_rollout(self.path, {f"{key}@{name}": value for name, own in curves.items() for key, value in own.items()})
+        arrays: dict[str, Any] = {f"{key}@{name}": value for name, own in curves.items() for key, value in own.items()}
+        write_npz(self.path / "rollout.npz", **arrays)
         errors = list(rows.values())
         write_json(
             self.folder.metrics, {"runs": errors, "unit": "mm", "what": "root mean square distance of the points"}
         )
         files = [self.path / f"{refine_stem(c, self._conditions[0])}.json" for c in self._conditions]
-        refined = [named(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
-        write_page(self.folder.report, self.tracks, twin, errors, curves, refined)
+        refined = [with_scopes(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
+        write_report(self.folder.report, self.tracks, twin, errors, curves, refined)
         return errors
 
 
 def refine_stem(condition: str | None, first: str) -> str:
     """Name of the files of ``refine`` without their extension: refine for the ``first`` condition (None: that one),
-    refine.CONDITION for another. A condition is any text: what no file name may hold is percent-encoded, so that no two
-    conditions share a file."""
-    return "refine" if condition is None or condition == first else f"refine.{quote(condition, safe=' ')}"
+    refine.CONDITION for another. A condition is any text: what a file name cannot hold is percent-encoded, and so are
+    dots, so that no two conditions share a file and none has that of a dry run (refine.CONDITION.dry_run)."""
+    if condition is None or condition == first:
+        return "refine"
+    encoded = quote(condition, safe=" ").replace(".", "%2E")
+    return f"refine.{'dry%5Frun' if encoded == 'dry_run' else encoded}"
+
+
+def law_entry(twin: Twin) -> dict[str, Any]:
+    """Kind and parameters of the law; the standard error of one that was given is None."""
+    if twin.rigid:
+        return {"kind": "rigid", "parameters": {}}
+    described = twin.law.description()
+    rows = {name: {"stderr": None, **row} for name, row in described["parameters"].items()}
+    return {"kind": described["kind"], "parameters": rows}
 
 
 def _table(rows: list[dict[str, Any]]) -> list[str]:

@@ -38,7 +38,7 @@ def vary_twin(
     twin = Twin.load(run.path)
     if law is not None:
         other = Twin.load(require_run(law, "--law"))
-        twin = replace(twin, law=blend_laws(twin.law, other.law, 1.0 if blend is None else blend))
+        twin = twin.with_body(law=blend_laws(twin.law, other.law, 1.0 if blend is None else blend))
     if density is not None:
         twin = variation.with_density(twin, density)
     if geometry is None:

@@ -79,7 +79,7 @@ class VideoRun(Run):
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
         from masiv.report.numbers import law_text, material_numbers, run_numbers, table
-        from masiv.report.report import write_report
+        from masiv.report.video import write_report
         from masiv.simulation.simulate import simulate
 
         folder, scene = self.folder, self.scene
@@ -132,14 +132,15 @@ class VideoRun(Run):
         self.start()
         from masiv.pipeline.variation import vary_twin
         from masiv.report.film import film
-        from masiv.simulation.simulate import Push, simulate
+        from masiv.simulation.force import ForcePulse
+        from masiv.simulation.simulate import simulate
         from masiv.simulation.twin_effects import body_mass
         from masiv.simulation.variation import without_effects
 
-        push = None
+        force = None
         if request.force is not None:
             until = float("inf") if request.force_until is None else request.force_until
-            push = Push(request.force, request.force_from or 0.0, until)
+            force = ForcePulse(request.force, request.force_from or 0.0, until)
         twin, gaussians = vary_twin(
             self.folder,
             law=request.law,
@@ -151,7 +152,7 @@ class VideoRun(Run):
         twin = without_effects(twin, request.without)
         rollout = simulate(
             twin, frames=request.frames, fps=self.scene.fps, velocity=request.velocity, omega=request.omega,
-            gravity=request.gravity, push=push, progress=progress,
+            gravity=request.gravity, force=force, progress=progress,
         )  # fmt: skip
         out.mkdir(parents=True, exist_ok=True)
         rollout.save(out / "rollout.npz")

@@ -1,4 +1,4 @@
-"""What refine says it found, in words, from refine.json. Light: no torch, no taichi."""
+"""The verdict of refine in words, from refine.json. Light: no torch, no taichi."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any
 
 
 def answer(document: Mapping[str, Any]) -> str:
-    """The verdict with what was accepted, and where the motion does not tell one cause from others, with these."""
-    names = ", ".join(map(_named, document["accepted"]))
+    """The verdict with what was accepted, and, if the motion does not distinguish an effect from others, with these."""
+    names = ", ".join(map(_with_others, document["accepted"]))
     if not names:
         return document["verdict"]
-    beside = ", beside what was added" if document["verdict"] == "unexplained residual" else ""
-    return f"{document['verdict']}{beside}: {names}"
+    added = ", although an effect was added" if document["verdict"] == "unexplained residual" else ""
+    return f"{document['verdict']}{added}: {names}"
 
 
-def _named(entry: Mapping[str, Any]) -> str:
-    others = entry.get("or_else")
+def _with_others(entry: Mapping[str, Any]) -> str:
+    others = entry.get("indistinguishable_from")
     if not others:
         return words(entry["effect"])
     return f"one of {', '.join(map(words, [entry['effect'], *others]))} (this motion does not tell which)"

@@ -1,110 +1,134 @@
-"""What the best models without any effect make of a motion."""
+"""Fits of classical laws without any effect, from which a search starts."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-
-import numpy as np
+from dataclasses import dataclass
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.identify.classical.fit import FamilyFit, fit_family
 from masiv.identify.classical.model_selection import rank_by_bic
 from masiv.identify.losses.objective import Objective
-from masiv.inference.model_fit import (
-    ModelFit,
-    column,
-    evaluate_fit,
-    gauss_newton_fit,
-    robust_scale_of,
-    with_start_values,
-)
+from masiv.inference.least_squares import linearize, with_start_values
+from masiv.inference.model_fit import ModelFit, evaluate_fit, gauss_newton_fit, residual_of
+from masiv.inference.robust import robust_scale_of
 from masiv.models.families import FAMILIES
-from masiv.models.free_body import Model, Simulation, parameters
+from masiv.models.free_body import Model, Simulation
 from masiv.models.initial_state import InitialState
 from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
+from masiv.refine.search import fits_of
 from masiv.refine.tasks import map_tasks
-from masiv.workers import TaskError, Workers, unwrap
+from masiv.workers import TaskError, Workers
 
-SHORT, HALF = 1 / 3, 1 / 2
-DONE = 2
+SHORT_BUDGET, BUDGET = 1 / 3, 1 / 2
+"""Parts of the rollouts that identify allows a stage: of the short fits that choose the laws, and of the others."""
+ALL_FRAMES_STAGE = 2
 """``FamilyFit.stage`` of a fit to all frames."""
 
 
+@dataclass(frozen=True)
+class BaselineProblem:
+    """The fitted frames of the first observation. coarse: on the particles of the search; coarser: on fewer;
+    first_frames: frames of the first fit, free flight and first contact."""
+
+    coarse: Problem
+    coarser: Problem
+    first_frames: int
+
+
 def baselines(
-    simulation: Simulation,
-    coarse: Problem,
-    coarser: Problem,
-    first_frames: int,
+    forward_model: Simulation,
+    problem: BaselineProblem,
     config: RefineConfig,
     checkpoint: Checkpoint,
     progress: Progress,
-    workers: Workers | None = None,
+    workers: Workers,
 ) -> list[ModelFit]:
     """Fits of the classical laws that explain the motion best, without effects.
 
-    few: the first experiment's fitted frames alone; fewer: the same with fewer particles. Where more than
-    ``config.families`` laws may compete, those best in a short fit to ``coarser`` do. They are fitted to ``coarse``,
-    then to all experiments. Raises MasivError where no law explains the motion.
+    If more than ``config.families`` laws may compete, those best in a short fit on ``problem.coarser`` do. They are
+    fitted on ``problem.coarse``, then to all observations. Raises MasivError if no law explains the motion.
     """
-    workers = workers or Workers()
-    motion = simulation.observations[0].motion
     kinds = [n for n in FAMILIES if not config.laws or n in config.laws]
-    progress("refine: laws without effects", 0, len(kinds), ", ".join(kinds))
+    progress(LABEL, 0, len(kinds), ", ".join(kinds))
     if len(kinds) > config.families:
-        found = workers.map(_fitted, [(kind, coarser, motion, first_frames, SHORT) for kind in kinds])
-        short = _some(list(_known(kinds, found, progress)))
-        kinds = [f.kind for f in rank_by_bic(short)[: config.families]]
-    saved = {kind: FamilyFit(**state) for kind, state in (checkpoint.load() or {}).items() if state["stage"] >= DONE}
+        kinds = _shortlist(forward_model, problem, kinds, config, progress, workers)
+    fits = _fitted(forward_model, problem, kinds, checkpoint, progress, workers)
+    starts = [_start(forward_model, fit) for fit in fits]
+    results = map_tasks(workers, forward_model, differentiated, [(*s, config.baseline_rollouts) for s in starts])
+    return fits_of(results)
+
+
+LABEL = "refine: laws without effects"
+
+
+def _shortlist(
+    forward_model: Simulation, problem: BaselineProblem, kinds: Sequence[str], config: RefineConfig, progress: Progress,
+    workers: Workers,
+) -> list[str]:  # fmt: skip
+    """The laws that are best in a short fit."""
+    motion = forward_model.observations[0].motion
+    tasks = [(kind, problem.coarser, motion, problem.first_frames, SHORT_BUDGET) for kind in kinds]
+    short = list(_known(kinds, workers.map(_fit_family, tasks), progress))
+    return [f.kind for f in rank_by_bic(_some(short))[: config.families]]
+
+
+def _fitted(
+    forward_model: Simulation, problem: BaselineProblem, kinds: Sequence[str], checkpoint: Checkpoint,
+    progress: Progress, workers: Workers,
+) -> list[FamilyFit]:  # fmt: skip
+    """Fits of the laws ``kinds``, those in the checkpoint taken from there."""
+    motion = forward_model.observations[0].motion
+    states = (checkpoint.load() or {}).items()
+    saved = {kind: FamilyFit(**state) for kind, state in states if state["stage"] >= ALL_FRAMES_STAGE}
     missing = [kind for kind in kinds if kind not in saved]
-    found = workers.map(_fitted, [(kind, coarse, motion, first_frames, HALF) for kind in missing])
-    for fit in _known(missing, found, progress):
+    tasks = [(kind, problem.coarse, motion, problem.first_frames, BUDGET) for kind in missing]
+    for fit in _known(missing, workers.map(_fit_family, tasks), progress):
         saved[fit.kind] = fit
         checkpoint.save({kind: fit.state() for kind, fit in saved.items()})
-    models = [_carried(simulation, saved[kind]) for kind in _some([kind for kind in kinds if kind in saved])]
-    fits = map_tasks(workers, simulation, derived, [(*m, config.baseline_rollouts) for m in models])
-    return [unwrap(fitted) for fitted in fits]
+    return _some([saved[kind] for kind in kinds if kind in saved])
 
 
-def _fitted(kind: str, problem: Problem, motion: InitialState, first_frames: int, share: float) -> FamilyFit:
-    return fit_family(kind, Objective(problem), motion, first_frames, Checkpoint(None), silent, budget_factor=share)
+def _fit_family(kind: str, problem: Problem, motion: InitialState, first_frames: int, budget: float) -> FamilyFit:
+    return fit_family(kind, Objective(problem), motion, first_frames, Checkpoint(None), silent, budget_factor=budget)
 
 
-def _known(kinds: Sequence[str], found: Iterable[FamilyFit | TaskError], progress: Progress) -> Iterator[FamilyFit]:
+def _known(kinds: Sequence[str], results: Iterable[FamilyFit | TaskError], progress: Progress) -> Iterator[FamilyFit]:
     """Those that explain the motion."""
-    for done, (kind, fit) in enumerate(zip(kinds, found, strict=True)):
+    for done, (kind, fit) in enumerate(zip(kinds, results, strict=True)):
         note = fit.reason if isinstance(fit, TaskError) else f"{1e3 * fit.error_m:.1f} mm"
-        progress("refine: laws without effects", done + 1, len(kinds), f"{kind}: {note}")
+        progress(LABEL, done + 1, len(kinds), f"{kind}: {note}")
         if not isinstance(fit, TaskError):
             yield fit
 
 
-def _some(found: list) -> list:
-    """``found``, if there is any. Raises MasivError."""
-    if not found:
+def _some(fits: list[FamilyFit]) -> list[FamilyFit]:
+    """``fits``, if there are any. Raises MasivError."""
+    if not fits:
         raise MasivError("refine: no classical law explains the motion; look at its trajectory in the report")
-    return found
+    return fits
 
 
-def _carried(simulation: Simulation, found: FamilyFit) -> tuple[Model, dict[str, float]]:
-    """The model that fits the first experiment, and its values, to begin with in all."""
-    first = simulation.observations[0].name
-    family = FAMILIES[found.kind].scaled(simulation.observations[0].problem.scene.density)
+def _start(forward_model: Simulation, fit: FamilyFit) -> tuple[Model, dict[str, float]]:
+    """The model that fits the first observation, and its values, to start from in all."""
+    first = forward_model.observations[0]
+    family = FAMILIES[fit.kind].scaled(first.problem.scene.density)
     law = {p.name for p in family.parameters}
-    values = {name if name in law else f"{name}@{first}": value for name, value in found.values.items()}
-    model = Model(family, found.contact)
-    simulation.settle(model, values)
+    values = {name if name in law else f"{name}@{first.name}": value for name, value in fit.values.items()}
+    model = Model(family, fit.contact)
+    forward_model.settle(model, values)
     return model, values
 
 
-def derived(simulation: Simulation, model: Model, values: dict[str, float], rollouts: int) -> ModelFit:
-    """``values`` with derivatives; fitted to all experiments where there are several."""
-    if len(simulation.observations) > 1:
-        return gauss_newton_fit(simulation, model, values, budget=rollouts)
-    params = with_start_values(parameters(model, simulation.observations), values)
-    values = {p.name: p.start for p in params}
-    residual = simulation.residual(model, values)
-    jacobian = np.stack([column(simulation, model, values, residual, p) for p in params], axis=1)
-    return evaluate_fit(simulation, model, params, values, jacobian, robust_scale=robust_scale_of(residual))
+def differentiated(forward_model: Simulation, model: Model, values: dict[str, float], budget: int) -> ModelFit:
+    """``values`` with derivatives; fitted to all observations in ``budget`` rollouts if there are several. Raises
+    NonFiniteError."""
+    if len(forward_model.observations) > 1:
+        return gauss_newton_fit(forward_model, model, values, budget=budget)
+    parameters = with_start_values(forward_model.parameters(model), values)
+    here = linearize(residual_of(forward_model, model), parameters, {p.name: p.start for p in parameters})
+    scale = robust_scale_of(here.residual)
+    return evaluate_fit(forward_model, model, parameters, here.values, here.jacobian, robust_scale=scale)

@@ -1,19 +1,19 @@
-"""Which throw would tell two explanations apart?"""
+"""Which initial state would distinguish two explanations?"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from masiv.errors import NonFiniteError
-from masiv.inference.model_fit import ordered
+from masiv.inference.model_fit import ModelFit, rank_by_bic
 from masiv.models.free_body import Simulation
 from masiv.progress import Progress
-from masiv.refine.rounds import TELLS_APART
-from masiv.refine.search import SearchResult
+from masiv.refine.result import Proposal
+from masiv.refine.rounds import MIN_BIC_GAP, Round, SearchResult
 
-THROWS = (
+INITIAL_STATES = (
     ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((3.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0)),
     ((-3.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 3.0, 0.0), (0.0, 0.0, 0.0)), ((2.0, 2.0, 0.0), (0.0, 0.0, 0.0)),
     ((0.0, -3.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 1.0, 0.0), (0.0, 10.0, 0.0)), ((0.0, 1.0, 0.0), (10.0, 0.0, 0.0)),
@@ -22,58 +22,60 @@ THROWS = (
 """Velocities [m/s] and spins [rad/s] that a person could give a body by hand, simulation frame (y up)."""
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """velocity (3,) [m/s] and omega (3,) [rad/s], world frame, for which the two models differ most: by
-    ``difference_mm``, root mean square over particles and instants; ``present_mm`` in the throw that was filmed."""
-
-    between: tuple[str, str]
-    velocity: np.ndarray
-    omega: np.ndarray
-    difference_mm: float
-    present_mm: float
-
-
-def propose(simulation: Simulation, result: SearchResult, progress: Progress) -> Proposal | None:
-    """A throw between the first cause that was accepted and what may as well be there, or else the best other refit of
-    that round, where the data hardly tells them apart; else None."""
-    first = result.rounds[0] if result.rounds else None
+def propose(search: SearchResult, progress: Progress) -> Proposal | None:
+    """The initial state for which the first accepted effect and its closest rival differ most. None if nothing was
+    accepted, if the data distinguishes the two, and if the rollouts of all initial states diverge."""
+    first = search.rounds[0] if search.rounds else None
     if first is None or first.accepted is None:
         return None
     best = first.accepted.fitted
-    rivals = ordered([t.fitted for t in first.trials if t.fitted.model.effects != best.model.effects])
-    as_well = [f for f in rivals if f.model.effects[-1] in first.indistinguishable_from]
-    if not rivals:
+    rival = _rival(first, best)
+    if rival is None:
         return None
-    rival = (as_well or rivals)[0]
-    alike = first.confusable.get(best.model.effects[-1], [])
-    close = rival.bic(best.samples) - best.bic(best.samples) < TELLS_APART
-    if not as_well and not close and rival.model.effects[-1] not in alike:
-        return None
-    problem = simulation.observations[0].problem
-    suffix = f"@{simulation.observations[0].name}"
-    frames = problem.frames
+    forward_model = cast(Simulation, search.forward_model)
+    observation = forward_model.observations[0]
+    axes, suffix = observation.problem.axes, f"@{observation.name}"
 
-    def apart(throw: dict[str, float]) -> float:
-        try:
-            a, b = (simulation.positions(f.model, {**f.values, **throw}, 0, frames) for f in (best, rival))
-        except NonFiniteError:
-            return 0.0
+    def difference_mm(state: dict[str, float]) -> float:
+        frames = observation.problem.frames
+        a, b = (forward_model.positions(f.model, {**f.values, **state}, 0, frames) for f in (best, rival))
         return 1e3 * float((a - b).square().sum(2).mean().sqrt())
 
-    found = []
-    for done, (velocity, omega) in enumerate(THROWS):
-        progress("refine: propose a throw", done, len(THROWS))
-        named = {f"velocity_{a}{suffix}": v for a, v in zip("xyz", velocity, strict=True)}
-        named |= {f"omega_{a}{suffix}": v for a, v in zip("xyz", omega, strict=True)}
-        found.append((apart(named), velocity, omega))
-    progress("refine: propose a throw", len(THROWS), len(THROWS))
-    difference, velocity, omega = max(found)
-    axes = problem.axes
+    differences, failures = [], []
+    for done, (velocity, omega) in enumerate(INITIAL_STATES):
+        progress("refine: propose an initial state", done, len(INITIAL_STATES))
+        state = {f"velocity_{a}{suffix}": v for a, v in zip("xyz", velocity, strict=True)}
+        state |= {f"omega_{a}{suffix}": v for a, v in zip("xyz", omega, strict=True)}
+        try:
+            differences.append((difference_mm(state), velocity, omega))
+        except NonFiniteError as error:
+            world = (axes.vectors_to_world(np.array(v)) for v in (velocity, omega))
+            failures.append((*world, error.detail))
+    progress("refine: propose an initial state", len(INITIAL_STATES), len(INITIAL_STATES))
+    if not differences:
+        return None
+    try:
+        present = difference_mm({})
+    except NonFiniteError:
+        present = None
+    difference, velocity, omega = max(differences)
     return Proposal(
         (best.model.effects[-1], rival.model.effects[-1]),
         axes.vectors_to_world(np.array(velocity)),
         axes.vectors_to_world(np.array(omega)),
         difference,
-        apart({}),
+        present,
+        tuple(failures),
     )
+
+
+def _rival(first: Round, best: ModelFit) -> ModelFit | None:
+    """What may be there in place of the accepted effect, or else the best other refit of its round, if the data hardly
+    distinguishes them."""
+    rivals = rank_by_bic([t.fitted for t in first.trials if t.fitted.model.effects != best.model.effects])
+    equal = [f for f in rivals if f.model.effects[-1] in first.indistinguishable_from]
+    if equal or not rivals:
+        return equal[0] if equal else None
+    rival = rivals[0]
+    similar = rival.model.effects[-1] in first.confusable.get(best.model.effects[-1], [])
+    return rival if similar or best.bic_gain(rival) < MIN_BIC_GAP else None

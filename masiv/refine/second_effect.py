@@ -1,122 +1,145 @@
-"""A further cause that hides in what noise and grid explain: the first one took most of it over.
+"""A further effect that hides in what noise and discretization explain: the first one took most of it over.
 
-A uniform force takes over the drag that acts beside it, and quadratic drag a linear one with viscosity, so well that
-what is left is hardly more than the noise. A ranking on top of the first cause still sees the other, if on top of the
-right one: so it is looked for beside the accepted cause and beside the one that came closest to it. That near to the
-noise only a cause of one number is added to the accepted one, since it cannot adapt to an error of any shape.
+A uniform force takes over the drag that acts in addition, and quadratic drag a linear one with viscosity, so well that
+the residual is hardly above the noise. A ranking on top of the first effect still sees the other, if on top of the
+right one: so it is looked for in addition to the accepted effect, and in addition to the one that came closest to it.
+That near to the noise only an effect of one parameter is added, since it cannot adapt to an error of any shape.
 """
 
 from __future__ import annotations
 
-from masiv.inference.model_fit import ModelFit, warm_started_fit
+from dataclasses import dataclass, replace
+
+from masiv.inference.model_fit import ModelFit, common_samples, warm_started_fit
+from masiv.inference.noise_model import NoiseModel
 from masiv.models.base import ForwardModel
-from masiv.progress import Progress
-from masiv.refine.add_effect import refit
 from masiv.refine.candidates import Candidate
 from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import beyond_possible, held_out, removed_of, sigmas_from_zero
-from masiv.refine.rounds import Round, Trial, confusable
-from masiv.refine.selection import named
-from masiv.refine.tasks import map_tasks, ranked
-from masiv.workers import TaskError, Workers
+from masiv.refine.effect_fit import fit_with_effect
+from masiv.refine.evidence import parameters_at_bounds, rms_reduction, strength_z
+from masiv.refine.rounds import Round, confusable, rank_trials
+from masiv.refine.search_round import trials_of
+from masiv.refine.search_state import SearchSettings, SearchState
+from masiv.refine.selection import Selection, select
+from masiv.refine.tasks import map_tasks, rank
 
 MIN_SHARE = 0.05
-"""Share of what is left below which a cause is not tried."""
+"""Share of the residual below which an effect is not tried."""
 SHORTLIST = 2
+"""Effects that are fitted in addition to one base."""
 
 
-def search_second_effect(
-    simulation: ForwardModel,
-    current: ModelFit,
-    first: Round,
-    robust_scale: float,
-    config: RefineConfig,
-    progress: Progress,
-    workers: Workers,
-) -> list[Round]:
-    """Rounds on top of ``current``, the model with what ``first`` accepted, and of its closest rival. In the one that
-    has the best of all trials, if that passes, a cause is named as in any round; else nothing is."""
-    here = current.model
+@dataclass(frozen=True)
+class SecondSearch:
+    """fit: the model with what was accepted in the end; first: the round before, which names the effect of that model
+    that it had tried; rounds: what was tried in addition."""
+
+    fit: ModelFit
+    first: Round
+    rounds: tuple[Round, ...] = ()
+
+
+def search_second_effect(state: SearchState, first: Round, settings: SearchSettings) -> SecondSearch:
+    """Rounds on top of ``state.fit``, the model with what ``first`` accepted, and on top of its closest rival. In the
+    one that has the best of all trials, if that passes, an effect is named as in any round."""
+    here = state.fit.model
     rivals = [
         t.fitted
         for t in first.trials
         if t.passes and t.fitted.model.family is here.family and t.fitted.model.effects != here.effects
     ]
-    bases = [current, *(warm_started_fit(simulation, rival, robust_scale) for rival in rivals[:1])]
-    rounds = [_round(simulation, base, current, robust_scale, config, progress, workers) for base in bases]
+    bases = [state.fit, *(warm_started_fit(state.forward_model, r, state.robust_scale) for r in rivals[:1])]
+    rounds = [_round(state, base, settings) for base in bases]
     trials = [t for r in rounds for t in r.trials]
-    if trials:
-        samples = min((t.fitted for t in trials), key=lambda f: f.cost).samples
-        best = min(trials, key=lambda t: t.fitted.bic(samples))
-        for done in rounds:
-            if best.passes and best in done.trials:
-                ordered = sorted(done.trials, key=lambda t: t.fitted.bic(samples))
-                done.accepted, done.indistinguishable_from = named(ordered, simulation.observations, config)
-    return rounds
+    best = rank_trials(trials)[0] if trials else None
+    for k, done in enumerate(rounds):
+        if best is not None and best.passes and any(t is best for t in done.trials):
+            samples = common_samples([t.fitted for t in trials])
+            ordered = sorted(done.trials, key=lambda t: t.fitted.bic(samples))
+            selection = select(ordered, state.noise, settings.config)
+            rounds[k] = _accepting(done, selection)
+    return _merged(state, first, tuple(rounds))
 
 
-def _round(
-    simulation: ForwardModel,
-    base: ModelFit,
-    best: ModelFit,
-    robust_scale: float,
-    config: RefineConfig,
-    progress: Progress,
-    workers: Workers,
-) -> Round:
-    beside = ", ".join(base.model.effects)
-    names = [n for n in simulation.candidates(base.model) if len(simulation.term(n).parameters) == 1]
-    names = [n for n in names if n in config.effects or not config.effects]
-    if len(simulation.term(base.model.effects[-1]).parameters) > 1:
-        # A rival of many numbers with the accepted cause beside it is that cause with many numbers beside it.
-        names = [n for n in names if n not in best.model.effects]
-    label = f"refine: rank what may act beside {beside}"
-    candidates = ranked(
-        workers, simulation, base, robust_scale=robust_scale, names=names,
-        progress=lambda n, i, k: progress(label, i, k, n),
+def _accepting(done: Round, selection: Selection) -> Round:
+    return replace(done, accepted=selection.trial, indistinguishable_from=selection.indistinguishable_from)
+
+
+def _merged(state: SearchState, first: Round, rounds: tuple[Round, ...]) -> SecondSearch:
+    """With the two effects that explain more, if ``rounds`` accepted any."""
+    accepting = next((r for r in rounds if r.accepted is not None), None)
+    if accepting is None or accepting.accepted is None:
+        return SecondSearch(state.fit, first, rounds)
+    fit = accepting.accepted.fitted
+    if first.accepted is not None and accepting.base.model.effects != state.fit.model.effects:
+        (name,) = set(accepting.base.model.effects) - set(first.base.model.effects)
+        why = f"{' and '.join(fit.model.effects)} together explain more"
+        was = first.accepted
+        trials = [replace(t, objections=(*t.objections, why)) if t is was else t for t in first.trials]
+        named = next(t for t in trials if t.effect == name and t.passes)
+        first = replace(first, trials=tuple(trials), accepted=named, indistinguishable_from=())
+    return SecondSearch(fit, first, rounds)
+
+
+def _round(state: SearchState, base: ModelFit, settings: SearchSettings) -> Round:
+    """What may act in addition to the effects of ``base``."""
+    model = state.forward_model
+    names = [n for n in settings.considered(model, base.model) if len(model.term(n).parameters) == 1]
+    if len(model.term(base.model.effects[-1]).parameters) > 1:
+        # A rival of several parameters, to which the accepted effect is added, is that effect with several in addition.
+        names = [n for n in names if n not in state.fit.model.effects]
+    existing = ", ".join(base.model.effects)
+    label = f"refine: rank what may act in addition to {existing}"
+    ranking = rank(
+        settings.workers, model, base, names, robust_scale=state.robust_scale,
+        progress=lambda n, i, k: settings.progress(label, i, k, n),
     )  # fmt: skip
-    progress(label, 1, 1, candidates[0].effect if candidates else "none")
-    trials = []
-    worth = [c for c in candidates if c.explained >= MIN_SHARE][:SHORTLIST]
-    label = f"refine: fit effects beside {beside}"
-    progress(label, 0, len(worth), ", ".join(c.effect for c in worth))
-    fits = map_tasks(workers, simulation, _fitted, [(base, candidate, robust_scale) for candidate in worth])
-    for done, (candidate, fitted) in enumerate(zip(worth, fits, strict=True)):
-        if isinstance(fitted, TaskError):
-            progress(label, done + 1, len(worth), f"{candidate.effect}: {fitted.reason}")
-            continue
-        trials.append(Trial(candidate, fitted, objections(simulation, best, fitted, config)))
-        progress(label, done + 1, len(worth), f"{candidate.effect}: {fitted.fit_mm:.1f} mm")
-    return Round(base, candidates, trials, None, confusable(candidates, trials, config.confusable))
+    settings.progress(label, 1, 1, ranking.candidates[0].effect if ranking.candidates else "none")
+    shortlist = [c for c in ranking.candidates if c.explained >= MIN_SHARE][:SHORTLIST]
+    tasks = [(base, candidate, state.robust_scale) for candidate in shortlist]
+    fits = map_tasks(settings.workers, model, _fit_in_addition, tasks)
+    label = f"refine: fit effects in addition to {existing}"
+    trials, failures = trials_of(label, base.model.family.kind, shortlist, fits, settings)
+    judged = [
+        replace(t, objections=tuple(objections_to_pair(model, state.fit, t.fitted, settings.config))) for t in trials
+    ]
+    alike = confusable(ranking, judged, settings.config.confusable_correlation)
+    return Round(base, ranking, tuple(judged), None, alike, failures=tuple(failures))
 
 
-def _fitted(simulation: ForwardModel, base: ModelFit, candidate: Candidate, robust_scale: float) -> ModelFit:
-    return warm_started_fit(simulation, refit(simulation, base, candidate, robust_scale), robust_scale)
+def _fit_in_addition(
+    forward_model: ForwardModel, base: ModelFit, candidate: Candidate, robust_scale: float
+) -> ModelFit:
+    fitted = fit_with_effect(forward_model, base, candidate, robust_scale)
+    return warm_started_fit(forward_model, fitted, robust_scale)
 
 
-def objections(simulation: ForwardModel, before: ModelFit, after: ModelFit, config: RefineConfig) -> list[str]:
-    """Why the effects of ``after`` are not named instead of those of ``before``, which are one fewer; empty where they
-    are. Each must be there for certain, and held-out instants must confirm the two, the more so where the information
-    criterion is not clear. (Noise that is smooth in space and time looks like a slightly other gravity: what fitted
-    instants alone say is not enough so near to it.)"""
+def objections_to_pair(
+    forward_model: ForwardModel, before: ModelFit, after: ModelFit, config: RefineConfig
+) -> list[str]:
+    """Why the effects of ``after`` are not named instead of those of ``before``, which are one fewer; empty if they
+    are. Each must be significant, and held-out instants must confirm the two, the more so if the information criterion
+    is not clear. (Noise that is smooth in space and time looks like a slightly other gravity: what fitted instants
+    alone say is not enough so near to it.)"""
     out = []
-    gain = before.bic(after.samples) - after.bic(after.samples)
-    if gain < config.least_bic:
-        out.append(f"the information criterion falls by {gain:.1f}, less than {config.least_bic:g}")
+    gain = after.bic_gain(before)
+    if gain < config.min_bic_gain:
+        out.append(f"the information criterion falls by {gain:.1f}, less than {config.min_bic_gain:g}")
     for name in after.model.effects:
-        term = simulation.term(name)
-        sigmas = sigmas_from_zero(after, term)
-        if not sigmas >= config.least_sigmas:
-            out.append(f"{name} is {sigmas:.1f} standard errors from zero, less than {config.least_sigmas:g}")
-        out += beyond_possible(after, term)
-        out += simulation.objections(before, after, term, config)
-    was, now = (held_out(f, simulation.observations) for f in (before, after))
-    clear = gain >= config.clear_bic
+        term = forward_model.term(name)
+        z = strength_z(after, term)
+        if not z >= config.min_strength_z:
+            out.append(f"{name} is {z:.1f} standard errors from zero, less than {config.min_strength_z:g}")
+        out += parameters_at_bounds(after, term)
+        out += forward_model.objections(before, after, term, config)
+    noise = NoiseModel(forward_model.observations)
+    was, now = (noise.held_out(f.squares) for f in (before, after))
+    clear = gain >= config.clear_bic_gain
     if len(was):
-        removed = removed_of(was, now)
-        asked = config.least_gain * (1 if clear else 2)
+        removed = rms_reduction(was, now)
+        asked = config.min_gain * (1 if clear else 2)
         if removed < asked:
             out.append(f"it removes {100 * removed:.0f} % of the held-out error (asked: {100 * asked:.0f} %)")
     elif not clear:
-        out.append(f"the information criterion falls by {gain:.1f}, less than {config.clear_bic:g}")
+        out.append(f"the information criterion falls by {gain:.1f}, less than {config.clear_bic_gain:g}")
     return out

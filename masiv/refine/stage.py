@@ -1,142 +1,41 @@
-"""The refine stage: residual -> ranked effects -> joint refit -> confirmed on held-out frames -> twin with effects."""
+"""The stage: residual -> ranked effects -> joint refits -> what held-out data confirms."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 
-import numpy as np
-
-from masiv import runtime
-from masiv.checkpoint import Checkpoint
 from masiv.effects.catalogue import effect_named
-from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
 from masiv.inference.model_fit import ModelFit
-from masiv.models.families import law_of
-from masiv.models.free_body import Simulation, effect_parameters, initial_state_of
-from masiv.models.prepare import video_observation
-from masiv.mpm.config import SimulatorConfig
-from masiv.observations.motion import Observed, first_frames
-from masiv.progress import Progress, silent
-from masiv.refine.baselines import baselines
+from masiv.models.base import ForwardModel
 from masiv.refine.config import RefineConfig
-from masiv.refine.experiment_design import Proposal, propose
-from masiv.refine.search import SearchResult, search_effects
-from masiv.scene.scene import Scene
-from masiv.twin import Twin, TwinEffect
-from masiv.workers import Workers, process_count
-
-COMPETITORS = {
-    "jelly": ("neo_hookean", "von_mises"),
-    "plasticine": ("von_mises", "neo_hookean", "non_newtonian"),
-    "water": ("newtonian", "non_newtonian"),
-    # A Maxwell fluid that relaxes slower than the motion lasts is a solid.
-    "maxwell_fluid": ("newtonian", "non_newtonian", "von_mises", "neo_hookean"),
-    "sand": ("drucker_prager", "von_mises"),
-}
-"""Classical laws that are worth a try, by the law whose rollout was nearest to the motion in identify."""
-
-
-@dataclass(frozen=True)
-class Throw:
-    """One run. whole: the motion of all frames, of which the first ``fitted`` may be fitted; ``motion`` is of those."""
-
-    name: str
-    scene: Scene
-    motion: Observed
-    whole: Observed
-    fitted: int
-
-
-@dataclass(frozen=True)
-class Refined:
-    """What was found. fields: residuals before and after, simulated less observed, (K, N, 3) [m, simulation frame] of
-    each throw over all frames, at ``samples_per_frame`` instants a frame."""
-
-    result: SearchResult
-    simulation: Simulation
-    before: list[np.ndarray]
-    after: list[np.ndarray]
-    proposal: Proposal | None
-
-
-def split_frames(frame_count: int, fit_frames: int) -> int:
-    """How many frames refine fits: those that identify did, or all but the last quarter where it was given all."""
-    return fit_frames if fit_frames < frame_count else frame_count - max(1, frame_count // 4)
+from masiv.refine.result import RefineResult
+from masiv.refine.search import search_effects
+from masiv.refine.search_state import SearchSettings
 
 
 def refine(
-    throws: list[Throw],
-    identify: IdentifyConfig,
-    simulator: SimulatorConfig,
-    config: RefineConfig,
+    forward_model: ForwardModel,
+    baselines: Sequence[ModelFit],
+    settings: SearchSettings,
     *,
-    start: str | None = None,
-    dry_run: bool = False,
-    checkpoint: Checkpoint | None = None,
-    progress: Progress = silent,
-) -> Refined:
-    """Look for what the model lacks. throws: of one body, the first to be refined. start: the twin's pretrained law,
-    which chooses the competing classical laws unless ``config.laws`` does. dry_run: rank the effects, fit none.
+    condition: str | None = None,
+) -> RefineResult:
+    """Which effects does the model of ``forward_model``'s observations lack?
 
-    Raises InputError for an unknown effect in ``config.effects``, MasivError where no law explains the motion.
+    baselines: fits without those effects, one a law; none of the arguments is changed. condition: of the observations,
+    for the result. Raises InputError for an unknown effect in ``config.effects`` and for two observations of one name,
+    MasivError if no baseline can be simulated.
     """
+    check_effects(settings.config)
+    names = [e.name for e in forward_model.observations]
+    if len(set(names)) < len(names):
+        # Parameters are named after their observation.
+        raise ValueError(f"observations need names that differ: {', '.join(names)}")
+    search = search_effects(forward_model, baselines, settings)
+    return RefineResult(search, settings.config, settings.rank_only, condition=condition)
+
+
+def check_effects(config: RefineConfig) -> None:
+    """Raises InputError for a name in ``config.effects`` that is not in the library."""
     for name in config.effects:
         effect_named(name)
-    with runtime.torch_threads(1):
-        start = RENAMED_STARTS.get(start or "", start)
-        if not config.laws and start in COMPETITORS:
-            config = config.model_copy(update={"laws": list(COMPETITORS[start])})
-        made = [
-            video_observation(t.name, t.scene, first_frames(t.motion, t.fitted), t.whole, identify, simulator, config)
-            for t in throws
-        ]
-        simulation = Simulation([observation for observation, *_ in made])
-        _, coarse, coarser, initial_motion = made[0]
-        with Workers(process_count(config.processes)) as workers:
-            fits = baselines(
-                simulation,
-                coarse,
-                coarser,
-                min(initial_motion.last_frame + 2, coarse.frames),
-                config,
-                checkpoint or Checkpoint(None),
-                progress,
-                workers,
-            )
-            if dry_run:
-                config = config.model_copy(update={"shortlist": 0, "above_noise": 0.0})
-            result = search_effects(simulation, fits, config, progress, workers)
-        proposal = None if dry_run else propose(simulation, result, progress)
-        return Refined(result, simulation, result.before.fields, (result.gap or result.after).fields, proposal)
-
-
-def twin_of(fitted: ModelFit, throw: Throw, simulation: Simulation, old: Twin) -> Twin:
-    """``old`` with the law, throw, ground and effects of ``fitted``."""
-    observation = simulation.observations[0]
-    motion = initial_state_of(fitted.values, observation)
-    axes = observation.problem.axes
-    law = law_of(fitted.model.family, fitted.values)
-    law.stderr = {n: fitted.stderr[n] for n in law.values if math.isfinite(fitted.stderr.get(n, math.inf))}
-    effects = tuple(
-        TwinEffect(
-            name,
-            {p.name.split(".")[1]: fitted.values[p.name] for p in effect_parameters(name)},
-            {p.name.split(".")[1]: _known(fitted.stderr.get(p.name, math.inf)) for p in effect_parameters(name)},
-        )
-        for name in fitted.model.effects
-    )
-    return replace(
-        old,
-        velocity=axes.vectors_to_world(motion.velocity.double().numpy()),
-        omega=axes.vectors_to_world(motion.omega.double().numpy()),
-        ground=motion.ground(throw.scene.ground),
-        contact=fitted.model.contact,
-        law=law,
-        effects=effects,
-        fit={**old.fit, "refined": {"fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}},
-    )
-
-
-def _known(error: float) -> float | None:
-    return error if math.isfinite(error) else None

@@ -12,7 +12,7 @@ from masiv import metrics
 from masiv.errors import InputError
 from masiv.report.draw import draw, on_black
 from masiv.scene.scene import Ground, Scene
-from masiv.simulation.subdivide import wholes
+from masiv.simulation.subdivide import merge_subparticles
 from masiv.splat.gaussians import Gaussians
 
 UNITS = {
@@ -75,7 +75,7 @@ def agreement(rollout: np.ndarray, trajectory: np.ndarray) -> dict[str, Any]:
     Raises InputError where the former are not parts of the latter.
     """
     frames = min(len(rollout), len(trajectory))
-    simulated = wholes(rollout[:frames].astype(np.float64), trajectory.shape[1])
+    simulated = merge_subparticles(rollout[:frames].astype(np.float64), trajectory.shape[1])
     squared = ((simulated - trajectory[:frames]) ** 2).sum(-1).mean(-1)
     return {
         "frames": list(range(1, frames)),

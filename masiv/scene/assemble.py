@@ -1,4 +1,4 @@
-"""From what a reader found to a ``Scene``: conventions, what scene.yaml says, gaps."""
+"""Make a ``Scene`` of the pictures of a reader, the conventions of its layout, and scene.yaml."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 
 from masiv.errors import InputError
 from masiv.scene.declaration import SceneDeclaration
-from masiv.scene.pictures import Pictures, crop
+from masiv.scene.pictures import Pictures, crop_mask
 from masiv.scene.scene import Scene
 
-LISTED = 8
+MAX_LISTED = 8
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """What a layout takes for granted and scene.yaml may change.
+    """Defaults of a layout, for what scene.yaml does not declare.
 
-    up: axis. ground_height: of the plane across it [m], None where the layout says nothing of a ground. gravity [m/s²]
-    along −up, density [kg/m³]. up_assumed: nothing in the files says it. Guesses are said in ``problems`` unless
-    scene.yaml settles them.
+    up: axis. ground_height [m]: of the plane normal to it, None if the layout has no ground. gravity [m/s²] along −up;
+    density [kg/m³]. up_assumed: the files do not define ``up``. Assumptions become ``problems`` unless scene.yaml
+    declares the value.
     """
 
     up: str
@@ -41,7 +41,7 @@ def assemble(
     frame_count: int,
     problems: Iterable[str] = (),
 ) -> Scene:
-    """The scene. Raises InputError for a frame or a camera without a picture and for a scene.yaml that does not fit."""
+    """The scene. Raises InputError for a frame or camera without a picture and for a scene.yaml that does not fit."""
     cameras = pictures.cameras
     if declaration.fit_frames is not None and declaration.fit_frames > frame_count:
         raise InputError(f"scene.yaml: fit_frames is {declaration.fit_frames}, the scene has {frame_count} frames")
@@ -49,7 +49,7 @@ def assemble(
     up = declaration.up(conventions.up)
     corners = declaration.crop_corners()
     if corners is not None:
-        pictures = replace(pictures, crops=tuple(crop(camera, corners) for camera in cameras))
+        pictures = replace(pictures, crops=tuple(crop_mask(camera, corners) for camera in cameras))
     source, more = pictures.mask_sources()
     return Scene(
         path=folder,
@@ -81,7 +81,7 @@ def _guesses(declaration: SceneDeclaration, conventions: Conventions) -> list[st
 
 
 def _gaps(folder: Path, pictures: Pictures, frame_count: int) -> list[str]:
-    """A sentence a camera that lacks frames, or one sentence where many do."""
+    """One sentence for each camera that lacks frames, or one for all if there are many."""
     lacking: dict[int, list[int]] = {}
     for view, camera in enumerate(pictures.cameras):
         missing = [frame for frame in range(frame_count) if (view, frame) not in pictures.paths]
@@ -98,16 +98,16 @@ def _gaps(folder: Path, pictures: Pictures, frame_count: int) -> list[str]:
             "depth cannot be triangulated at any instant"
         ]
     told = [
-        f"{pictures.cameras[view].name} has no picture at frame {ranges(missing)}"
-        for view, missing in list(lacking.items())[:LISTED]
+        f"{pictures.cameras[view].name} has no picture at frame {format_ranges(missing)}"
+        for view, missing in list(lacking.items())[:MAX_LISTED]
     ]
-    if len(lacking) > LISTED:
+    if len(lacking) > MAX_LISTED:
         told = [f"{len(lacking)} of {len(pictures.cameras)} cameras lack frames ({'; '.join(told)}; …)"]
     return [f"{sentence}: treated as not visible" for sentence in told]
 
 
-def ranges(numbers: list[int]) -> str:
-    """Ascending whole numbers in short: 0–3, 7."""
+def format_ranges(numbers: list[int]) -> str:
+    """Ascending integers as text: 0–3, 7."""
     runs: list[list[int]] = []
     for value in numbers:
         if runs and value == runs[-1][-1] + 1:

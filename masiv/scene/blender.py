@@ -1,8 +1,8 @@
-"""Blender's layout as NeRF's synthetic scenes and D-NeRF (Pumarola et al., CVPR 2021) have it, with a time a picture.
+"""The Blender layout of NeRF's synthetic scenes and of D-NeRF (Pumarola et al., CVPR 2021).
 
-``transforms_train.json`` (``_val``, ``_test``): camera_angle_x [rad] and frames {file_path without extension, time,
-transform_matrix 4×4, OpenGL}. Alpha is the mask. World: z up; nothing is said of a ground. Times are seconds, unless
-fps in scene.yaml says how long a frame lasts.
+``transforms_train.json`` (``_val``, ``_test``) contains camera_angle_x [rad] and frames: {file_path without extension,
+time [s], transform_matrix 4×4 [m], camera to world, OpenGL axes}. Times have another unit if scene.yaml gives fps.
+Alpha is the mask. World: metres, z up, no ground.
 """
 
 from __future__ import annotations
@@ -10,22 +10,26 @@ from __future__ import annotations
 from pathlib import Path
 
 from masiv.scene.assemble import Conventions
-from masiv.scene.declaration import SceneDeclaration
+from masiv.scene.declaration import read_declaration
+from masiv.scene.layout import Layout
 from masiv.scene.posed_frames import posed_scene, read_listing
 from masiv.scene.scene import Scene
 
-LOOKED_FOR = "transforms_train.json"
+LISTING = "transforms_train.json"
 CONVENTIONS = Conventions(up="z", ground_height=None, up_assumed=True)
 SPLITS = ("transforms_val.json", "transforms_test.json")
 
 
-def recognises(folder: Path) -> bool:
+def can_read(folder: Path) -> bool:
     """Whether ``folder`` has this layout."""
-    return (folder / LOOKED_FOR).is_file()
+    return (folder / LISTING).is_file()
 
 
-def read(folder: Path, declaration: SceneDeclaration) -> Scene:
+def read(folder: Path) -> Scene:
     """The scene in ``folder``. Raises InputError for an unusable listing, camera, time or set of pictures."""
     extra = {name: read_listing(folder / name) for name in SPLITS if (folder / name).is_file()}
-    pictures = read_listing(folder / LOOKED_FOR)
-    return posed_scene(folder, "blender", declaration, CONVENTIONS, pictures, extra=extra)
+    pictures = read_listing(folder / LISTING)
+    return posed_scene(folder, "blender", read_declaration(folder), CONVENTIONS, pictures, extra=extra)
+
+
+LAYOUT = Layout("Blender", "transforms_train.json", can_read, read)

@@ -25,7 +25,7 @@ class ColmapCamera:
 
 
 def read_pinhole(path: Path) -> ColmapCamera:
-    """The first camera in ``path``. Raises InputError where it is missing, cut short or no pinhole camera."""
+    """The first camera in ``path``. Raises InputError if it is missing, truncated or not a pinhole camera."""
     if not path.is_file():
         raise InputError(f"{path} is missing: the focal length is read from it")
     data = path.read_bytes()

@@ -1,4 +1,4 @@
-"""What a user may say about a scene in a ``scene.yaml`` beside the data."""
+"""The ``scene.yaml`` next to the data of a scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 class GroundDeclaration(BaseModel):
-    """A plane {x : normal·x = height}; ``height`` [m] is along the normalised ``normal``."""
+    """A plane {x : normal·x = height}; ``height`` [m] along the normalized ``normal``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     normal: Vector
@@ -25,11 +25,11 @@ class GroundDeclaration(BaseModel):
 
 
 class SceneDeclaration(BaseModel):
-    """Keys of ``scene.yaml``. What is absent follows the layout's own convention.
+    """Keys of ``scene.yaml``. A missing key has the default of the layout.
 
     fps: frames per second. up_axis: x, y, z, with a minus sign, or three numbers. gravity: three numbers [m/s²], or one
     magnitude along −up. ground: `none` or {normal, height}. density [kg/m³]. crop_box: two opposite corners [m, world];
-    nothing outside of it is the object. fit_frames: fit on the first N frames unless --fit-frames says otherwise.
+    masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -1,4 +1,4 @@
-"""Intrinsics as they were calibrated, with OpenCV's lens distortion, and the pinhole camera that replaces them."""
+"""Calibrated intrinsics with OpenCV's lens distortion, and the pinhole camera of the undistorted picture."""
 
 from __future__ import annotations
 
@@ -40,24 +40,25 @@ class Lens:
     height: int
 
     @property
-    def straight(self) -> bool:
-        """Whether there is no distortion."""
+    def is_pinhole(self) -> bool:
+        """Whether the lens has no distortion."""
         return not self.coefficients.any()
 
     @cached_property
     def pinhole(self) -> np.ndarray:
-        """Intrinsics (3, 3) [pixels] of the undistorted picture: the widest one that is seen in every pixel.
+        """Intrinsics (3, 3) [pixels] of the undistorted picture: the widest one without empty pixels.
 
-        Raises InputError where the distortion folds inside of the picture, so that no pinhole picture exists.
+        Raises InputError if the distortion is not invertible inside of the picture.
         """
-        if self.straight:
+        if self.is_pinhole:
             return self.intrinsics
         size = self.width, self.height
         new, _ = cv2.getOptimalNewCameraMatrix(self.intrinsics - HALF, self.coefficients, size, 0)
         new = np.asarray(new, np.float64)
         if not np.isfinite(new).all() or min(new[0, 0], new[1, 1]) <= 0 or self._folds(new):
             raise InputError(
-                f"the lens distortion {_spelled(self.coefficients)} folds the picture over: check its coefficients"
+                f"the lens distortion {_format_coefficients(self.coefficients)} is not invertible in the picture: "
+                "check its coefficients"
             )
         return new + HALF
 
@@ -77,19 +78,19 @@ class Lens:
         return np.asarray(x), np.asarray(y)
 
     @cached_property
-    def seen(self) -> np.ndarray:
-        """Pixels (H, W) bool of the undistorted picture that the camera saw."""
-        if self.straight:
+    def visible(self) -> np.ndarray:
+        """Which pixels (H, W) bool of the undistorted picture are inside of the original one."""
+        if self.is_pinhole:
             return np.ones((self.height, self.width), bool)
         x, y = self._maps
         return (x >= -0.5) & (x <= self.width - 0.5) & (y >= -0.5) & (y <= self.height - 0.5)
 
-    def undistorted(self, pixels: np.ndarray) -> np.ndarray:
-        """A picture (H, W, 3) or (H, W, 4) uint8 as the pinhole camera sees it.
+    def undistort(self, pixels: np.ndarray) -> np.ndarray:
+        """A picture (H, W, 3) or (H, W, 4) uint8, resampled to the pinhole camera.
 
-        Colours are weighed by alpha, or the unseen colour of transparent pixels would leak into the rim.
+        Colours are weighted by alpha, so that the colour of transparent pixels does not leak into the edge.
         """
-        if self.straight:
+        if self.is_pinhole:
             return pixels
         x, y = self._maps
         values = pixels.astype(np.float32)
@@ -101,12 +102,12 @@ class Lens:
         return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
-def lens_of(row: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
-    """The lens that a nerfstudio, instant-ngp or Blender listing states, for pictures of ``width`` × ``height`` pixels.
+def read_lens(row: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
+    """The lens of a nerfstudio, instant-ngp or Blender listing, for pictures of ``width`` × ``height`` pixels.
 
-    ``row`` has fl_x (fl_y, cx, cy, w, h, k1, k2, p1, p2, k3, camera_model), or camera_angle_x [rad]. Numbers for w × h
-    are scaled where the pictures are smaller or larger. Raises InputError for a model that is no pinhole with OpenCV's
-    distortion, and for numbers that cannot be.
+    ``row`` contains fl_x (fl_y, cx, cy, w, h, k1, k2, p1, p2, k3, camera_model), or camera_angle_x [rad]. Intrinsics
+    for w × h are scaled to the size of the pictures. Raises InputError for a model that is not a pinhole with OpenCV's
+    distortion, and for impossible numbers.
     """
     coefficients = _coefficients(row, where)
     w, h = number(row, "w", where, width), number(row, "h", where, height)
@@ -147,5 +148,5 @@ def _focal(angle: float, pixels: float, where: str) -> float:
     return 0.5 * pixels / math.tan(0.5 * angle)
 
 
-def _spelled(coefficients: np.ndarray) -> str:
+def _format_coefficients(coefficients: np.ndarray) -> str:
     return ", ".join(f"{key} = {value:g}" for key, value in zip(COEFFICIENTS, coefficients, strict=True))

@@ -1,4 +1,4 @@
-"""Typed access to the JSON files of data sets; each trouble is an InputError that names the file and the entry."""
+"""Typed access to the JSON files of data sets. Each error is an InputError that names the file and the entry."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from masiv.errors import InputError
 
 
 def read_json(path: Path) -> Any:
-    """What ``path`` holds. Raises InputError where it is missing or is not JSON."""
+    """The content of ``path``. Raises InputError if it is missing or not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -38,7 +38,7 @@ def mapping(value: Any, where: str) -> Mapping[str, Any]:
 
 
 def number(row: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """``row[key]``, finite. Raises InputError where it is absent without a default, or no finite number."""
+    """``row[key]``, finite. Raises InputError if it is missing without a default, or not a finite number."""
     value = row.get(key, default)
     if value is None:
         raise InputError(f"{where} has no '{key}'")

@@ -1,4 +1,4 @@
-"""Where the object is in a picture: from a cut-out, from the empty background, or from a plain background.
+"""Masks of the object: from a cut-out, from the empty background, or from a plain background.
 
 Pictures are (H, W, 3) uint8 RGB; masks are (H, W) float32 in [0, 1], 1 on the object.
 """
@@ -10,10 +10,10 @@ import numpy as np
 
 
 def from_white(cutout: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Mask of an object painted on pure white.
+    """Mask of a ``cutout``: a copy of ``image`` that is pure white outside of the object.
 
-    A pure white pixel of the object cannot be told from the paint where ``image`` is white too; such pixels become the
-    object's when they form a hole that is small (below 1 % of the object) and closed.
+    A pixel that is white in ``image`` too can be part of the object. Such pixels are, if they form a closed hole
+    smaller than 1 % of the object.
     """
     mask = ~(cutout == 255).all(axis=-1)
     doubtful = ~mask & (image == 255).all(axis=-1)
@@ -29,35 +29,35 @@ def from_white(cutout: np.ndarray, image: np.ndarray) -> np.ndarray:
 
 
 def from_background(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Mask by difference from the empty background, refined along colour edges.
+    """Mask from the difference to the empty background, refined along colour edges.
 
-    A soft shadow darkens all channels alike: pixels that are a dimmed copy of the background, with little change of
-    texture, count as background. GrabCut (Rother et al. 2004) then settles the uncertain rim.
+    A soft shadow darkens all channels by the same factor, so pixels that are a darker copy of the background belong to
+    it. GrabCut (Rother et al. 2004) then decides about uncertain pixels near the edge.
     """
-    light, empty = _blurred(image), _blurred(background)
+    light, empty = _blur(image), _blur(background)
     gain = (light * empty).sum(-1) / np.maximum((empty * empty).sum(-1), 1.0)
     dimmed = np.abs(light - gain[..., None] * empty).max(axis=-1)
     difference = np.abs(light - empty).max(axis=-1)
     noise = 1.4826 * np.median(difference) + 1.0
     shadow = (gain > 0.35) & (gain < 1.05) & (dimmed < max(3.0 * noise, 8.0))
-    return _refined(image, difference, noise, shadow)
+    return _refine(image, difference, noise, shadow)
 
 
 def from_plain_background(image: np.ndarray) -> np.ndarray:
-    """Mask by difference from the median colour of the picture's border; for an object before a plain background."""
+    """Mask from the difference to the median colour of the picture's border, for a plain background."""
     border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
     colour = np.median(border, axis=0)
     difference = np.abs(image.astype(np.float32) - colour).max(axis=-1)
     noise = 1.4826 * np.median(np.abs(border - colour).max(axis=-1)) + 1.0
-    return _cleaned(difference > max(4.0 * noise, 16.0)).astype(np.float32)
+    return _clean(difference > max(4.0 * noise, 16.0)).astype(np.float32)
 
 
-def _blurred(image: np.ndarray) -> np.ndarray:
+def _blur(image: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32)
 
 
-def _refined(image: np.ndarray, difference: np.ndarray, noise: float, shadow: np.ndarray) -> np.ndarray:
-    seed = _cleaned((difference > max(6.0 * noise, 20.0)) & ~shadow)
+def _refine(image: np.ndarray, difference: np.ndarray, noise: float, shadow: np.ndarray) -> np.ndarray:
+    seed = _clean((difference > max(6.0 * noise, 20.0)) & ~shadow)
     if seed.sum() < 16:
         return seed.astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)
@@ -74,11 +74,11 @@ def _refined(image: np.ndarray, difference: np.ndarray, noise: float, shadow: np
         cv2.grabCut(bgr, trimap, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
     except cv2.error:
         return seed.astype(np.float32)  # one class is empty: nothing to refine
-    return _cleaned((trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)).astype(np.float32)
+    return _clean((trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)).astype(np.float32)
 
 
-def _cleaned(mask: np.ndarray) -> np.ndarray:
-    """Without specks, with small holes closed, and only components of at least 2 % of the largest."""
+def _clean(mask: np.ndarray) -> np.ndarray:
+    """Remove specks, close small holes, and keep only components of at least 2 % of the largest."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
     closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel)

@@ -1,7 +1,9 @@
 """The PAC-NeRF layout (Li et al., ICLR 2023), also that of MASIV's multi-sequence scenes.
 
-``all_data.json`` lists {file_path, c2w, intrinsic, time}; pictures are ``data/r_V_F.png`` for view V and frame F,
-frame −1 the empty background, frame −2 an occluder. World: metres, y up, gravity 9.8 m/s² down, sticky ground at y = 0.
+``all_data.json`` lists {file_path, c2w 3×4 [m], camera to world, OpenGL axes, intrinsic 3×3 [pixels], time [s]}.
+Pictures are ``data/r_V_F.png`` for view V and frame F; frame −1 is the empty background, frame −2 an occluder. Masks:
+``data/a_V_F.png`` (alpha) or ``data/m_V_F.png`` (the object on white), else the difference to the background. World:
+metres, y up, gravity 9.8 m/s², ground at y = 0.
 """
 
 from __future__ import annotations
@@ -15,14 +17,14 @@ import numpy as np
 from masiv.errors import InputError
 from masiv.scene.assemble import Conventions, assemble
 from masiv.scene.camera import Camera
-from masiv.scene.declaration import SceneDeclaration
+from masiv.scene.declaration import read_declaration
+from masiv.scene.layout import Layout
 from masiv.scene.listing import entries as listed_entries
 from masiv.scene.listing import read_json
 from masiv.scene.pictures import PLAIN, MaskSource, Pictures, common_size
 from masiv.scene.scene import Scene
-from masiv.scene.transforms import frame_of_time, opengl_c2w_to_world_to_camera, whole_if_near
+from masiv.scene.transforms import frame_of_time, opengl_c2w_to_world_to_camera, round_if_close
 
-LOOKED_FOR = "all_data.json or all_data_full.json"
 NAMES = ("all_data_full.json", "all_data.json")
 PICTURE = re.compile(r"^(?P<prefix>.*?)(?P<view>\d+)_(?P<frame>-?\d+)\.(png|jpg|jpeg)$", re.IGNORECASE)
 BACKGROUND, OCCLUDER = -1, -2
@@ -39,13 +41,14 @@ class _Entry:
     world_to_camera: np.ndarray
 
 
-def recognises(folder: Path) -> bool:
+def can_read(folder: Path) -> bool:
     """Whether ``folder`` has this layout."""
     return any((folder / name).is_file() for name in NAMES)
 
 
-def read(folder: Path, declaration: SceneDeclaration) -> Scene:
+def read(folder: Path) -> Scene:
     """The scene in ``folder``. Raises InputError for an unusable listing, camera, time or set of pictures."""
+    declaration = read_declaration(folder)
     listing = next(folder / name for name in NAMES if (folder / name).is_file())
     entries = _entries(folder, listing)
     observed = [e for e in entries if e.frame >= 0]
@@ -56,14 +59,14 @@ def read(folder: Path, declaration: SceneDeclaration) -> Scene:
     fps = declaration.fps or _fps(observed, listing)
     present = [e for e in observed if e.path.is_file() and e.path.stat().st_size > 0]
     cameras = tuple(_camera(view, observed, present, listing) for view in view_ids)
-    backgrounds = _special(entries, folder, view_ids, BACKGROUND)
+    backgrounds = _extra_pictures(entries, folder, view_ids, BACKGROUND)
     paths = {(view_ids.index(e.view), e.frame): e.path for e in present}
     pictures = Pictures(
         paths=paths,
         masks={key: _mask_source(path, key[0] in backgrounds) for key, path in paths.items()},
         cameras=cameras,
         backgrounds=backgrounds,
-        occluders=_special(entries, folder, view_ids, OCCLUDER),
+        occluders=_extra_pictures(entries, folder, view_ids, OCCLUDER),
     )
     return assemble(folder, "pacnerf", declaration, CONVENTIONS, pictures, fps=fps, frame_count=frame_count)
 
@@ -113,7 +116,7 @@ def _fps(observed: list[_Entry], listing: Path) -> float:
     first, last = min(observed, key=lambda e: e.frame), max(observed, key=lambda e: e.frame)
     if last.time <= first.time:
         raise InputError(f"{listing}: time does not increase with the frame; fix it or give fps in scene.yaml")
-    fps = whole_if_near((last.frame - first.frame) / (last.time - first.time))
+    fps = round_if_close((last.frame - first.frame) / (last.time - first.time))
     for entry in observed:
         steps = (entry.time - first.time) * fps
         if frame_of_time(entry.time - first.time, fps) != entry.frame - first.frame or abs(steps - round(steps)) > 0.25:
@@ -140,7 +143,7 @@ def _camera(view: int, observed: list[_Entry], present: list[_Entry], listing: P
     return Camera(f"view {view}", width, height, first.intrinsics, first.world_to_camera)
 
 
-def _special(entries: list[_Entry], folder: Path, view_ids: list[int], frame: int) -> dict[int, Path]:
+def _extra_pictures(entries: list[_Entry], folder: Path, view_ids: list[int], frame: int) -> dict[int, Path]:
     """Pictures of the empty background or of the occluder, by camera; they need not be listed."""
     listed = {e.view: e.path for e in entries if e.frame == frame}
     paths = {i: listed.get(v, folder / "data" / f"r_{v}_{frame}.png") for i, v in enumerate(view_ids)}
@@ -148,15 +151,18 @@ def _special(entries: list[_Entry], folder: Path, view_ids: list[int], frame: in
 
 
 def _mask_source(path: Path, has_background: bool) -> MaskSource:
-    if (alpha := _beside(path, "a")).is_file():
+    if (alpha := _sibling(path, "a")).is_file():
         return MaskSource("alpha", "alpha pictures a_V_F.png", alpha)
-    if (cutout := _beside(path, "m")).is_file():
+    if (cutout := _sibling(path, "m")).is_file():
         return MaskSource("cutout", "cut-outs on white m_V_F.png", cutout)
     return MaskSource("background", "difference from the background frame −1") if has_background else PLAIN
 
 
-def _beside(path: Path, kind: str) -> Path:
+def _sibling(path: Path, kind: str) -> Path:
     """data/r_V_F.png -> data/m_V_F.png (kind 'm') or data/a_V_F.png (kind 'a')."""
     match = PICTURE.match(path.name)
     assert match is not None
     return path.with_name(f"{kind}_{match['view']}_{match['frame']}.png")
+
+
+LAYOUT = Layout("PAC-NeRF", "all_data.json or all_data_full.json", can_read, read)

@@ -23,7 +23,7 @@ Key = tuple[int, int]  # camera index, frame
 
 @dataclass(frozen=True)
 class MaskSource:
-    """Where the mask of a picture comes from; ``words`` say it to a person.
+    """The source of a picture's mask; ``description`` is for messages.
 
     alpha: the fourth channel of ``path``, or of the picture itself. mask: ``path`` is white on the object. cutout:
     ``path`` has all but the object painted white. background: difference from the view's empty background. plain:
@@ -31,7 +31,7 @@ class MaskSource:
     """
 
     kind: Literal["alpha", "mask", "cutout", "background", "plain"]
-    words: str
+    description: str
     path: Path | None = None
 
 
@@ -41,10 +41,10 @@ OWN_ALPHA = MaskSource("alpha", "alpha channel of the pictures")
 
 @dataclass(frozen=True)
 class Pictures:
-    """Reads pictures and masks as the pinhole ``cameras`` see them.
+    """Files of pictures and masks, read as the pinhole ``cameras`` see them.
 
-    ``lenses``, by camera, undistort; ``backgrounds`` are pictures of the empty scene, ``occluders`` have alpha where
-    something hides it, both by camera; ``crops``, by camera, are (H, W) bool, False where the object cannot be.
+    By camera: ``lenses`` to undistort; ``backgrounds``, pictures of the empty scene; ``occluders``, pictures with
+    positive alpha on what hides the scene; ``crops`` (H, W) bool, False outside of the declared crop box.
     """
 
     paths: dict[Key, Path]
@@ -56,11 +56,14 @@ class Pictures:
     crops: tuple[np.ndarray, ...] | None = None
 
     def load(self, view: int, frame: int) -> Frame:
-        """What ``view`` saw at ``frame``; a picture that does not exist is black and nowhere valid."""
+        """The picture of ``view`` at ``frame``. One that does not exist is black, and not valid anywhere.
+
+        Raises InputError if a file cannot be read or its size differs from that of its view.
+        """
         camera = self.cameras[view]
         path = self.paths.get((view, frame))
         if path is None:
-            return _nothing(camera.height, camera.width)
+            return _missing_frame(camera.height, camera.width)
         image = self._read(view, path)
         if self.masks[view, frame] == OWN_ALPHA and image.shape[-1] != 4:
             raise InputError(
@@ -69,7 +72,7 @@ class Pictures:
         mask = self._mask(view, self.masks[view, frame], image)
         valid = np.ones(image.shape[:2], bool)
         if view in self.lenses:
-            valid &= self.lenses[view].seen
+            valid &= self.lenses[view].visible
         if view in self.occluders:
             occluder = self._read(view, self.occluders[view])
             if occluder.shape[-1] == 4:
@@ -79,17 +82,17 @@ class Pictures:
         return Frame(image[..., :3], mask, valid)
 
     def background(self, view: int) -> np.ndarray | None:
-        """The empty scene in ``view``, (H, W, 3) uint8, where there is a picture of it."""
+        """The empty scene in ``view``, (H, W, 3) uint8, or None if there is no picture of it."""
         return self._read(view, self.backgrounds[view])[..., :3] if view in self.backgrounds else None
 
     def mask_sources(self) -> tuple[str, list[str]]:
-        """The main source of the masks, in words, and a problem for each picture set that has another one."""
+        """The description of the main source of the masks, and a problem for each other source."""
         kinds: dict[str, list[str]] = {}
         for key, path in self.paths.items():
-            kinds.setdefault(self.masks[key].words, []).append(path.name)
+            kinds.setdefault(self.masks[key].description, []).append(path.name)
         main, *others = sorted(kinds, key=lambda kind: -len(kinds[kind]))
         problems = [f"{len(kinds[o])} pictures ({kinds[o][0]}, …) take their mask from {o}" for o in others]
-        if any(decoded(p).shape[-1] != 4 for p in self.occluders.values()):
+        if any(read_pixels(p).shape[-1] != 4 for p in self.occluders.values()):
             problems.append("the occluder pictures (frame −2) have no alpha channel and are ignored")
         return main, problems
 
@@ -108,18 +111,18 @@ class Pictures:
         return masks.from_plain_background(colour)
 
     def _read(self, view: int, path: Path) -> np.ndarray:
-        pixels = decoded(path)
+        pixels = read_pixels(path)
         height, width = pixels.shape[:2]
         camera = self.cameras[view]
         if (width, height) != (camera.width, camera.height):
             raise InputError(
                 f"{path} is {width}×{height}, the other pictures of its view are {camera.width}×{camera.height}"
             )
-        return self.lenses[view].undistorted(pixels) if view in self.lenses else pixels
+        return self.lenses[view].undistort(pixels) if view in self.lenses else pixels
 
 
-def decoded(path: Path) -> np.ndarray:
-    """(H, W, 3) RGB or (H, W, 4) RGBA, uint8. Raises InputError for what is no picture."""
+def read_pixels(path: Path) -> np.ndarray:
+    """The picture (H, W, 3) RGB or (H, W, 4) RGBA, uint8. Raises InputError if the file is not a picture."""
     raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if raw is None:
         raise InputError(f"{path} cannot be read as a picture: replace it or remove it from the listing")
@@ -133,33 +136,33 @@ def decoded(path: Path) -> np.ndarray:
     return np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[-1]]])
 
 
-def size(path: Path) -> tuple[int, int]:
-    """Width and height, from the header where the file is a PNG."""
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height [pixels], from the header if the file is a PNG."""
     with path.open("rb") as file:
         head = file.read(24)
     if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
         return struct.unpack(">II", head[16:24])
-    height, width = decoded(path).shape[:2]
+    height, width = read_pixels(path).shape[:2]
     return width, height
 
 
 def common_size(paths: list[Path], of_what: str) -> tuple[int, int]:
-    """Width and height that all ``paths`` share. Raises InputError where they differ."""
-    sizes = {size(path): path for path in paths}
+    """Width and height [pixels] that all ``paths`` share. Raises InputError if they differ."""
+    sizes = {image_size(path): path for path in paths}
     if len(sizes) > 1:
         listed = ", ".join(f"{path.name} {w}×{h}" for (w, h), path in sizes.items())
         raise InputError(f"pictures of {of_what} differ in size: {listed}")
     return next(iter(sizes))
 
 
-def cuts_out(path: Path) -> bool:
+def has_transparency(path: Path) -> bool:
     """Whether the picture has an alpha channel that is not opaque everywhere."""
-    pixels = decoded(path)
+    pixels = read_pixels(path)
     return pixels.shape[-1] == 4 and bool((pixels[..., 3] < 255).any())
 
 
-def crop(camera: Camera, corners: np.ndarray) -> np.ndarray:
-    """Pixels (H, W) bool that a box with these corners (8, 3) covers; all for a box that reaches behind the camera."""
+def crop_mask(camera: Camera, corners: np.ndarray) -> np.ndarray:
+    """Which pixels (H, W) bool a box with ``corners`` (8, 3) [m] covers; all if it reaches behind the camera."""
     pixels, depth = camera.project(corners)
     if depth.min() <= 1e-6:
         return np.ones((camera.height, camera.width), bool)
@@ -168,13 +171,13 @@ def crop(camera: Camera, corners: np.ndarray) -> np.ndarray:
 
 
 def _as_mask(pixels: np.ndarray) -> np.ndarray:
-    """Mask from a mask picture: its alpha where that varies, else its brightness; 0 and 1 count as 0 and 255."""
+    """Mask from a mask picture: its alpha if that varies, else its brightness. Values of 0 and 1 mean 0 and 255."""
     alpha_varies = pixels.shape[-1] == 4 and (pixels[..., 3] != pixels[0, 0, 3]).any()
     values = (pixels[..., 3] if alpha_varies else pixels[..., :3].max(axis=-1)).astype(np.float32)
     return values if values.max() <= 1 else values / 255
 
 
 @cache
-def _nothing(height: int, width: int) -> Frame:
+def _missing_frame(height: int, width: int) -> Frame:
     shape = height, width
     return Frame(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32), np.zeros(shape, bool))

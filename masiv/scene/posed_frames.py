@@ -1,4 +1,4 @@
-"""``transforms*.json``: pictures that each have a pose and a time. Shared by the Blender and the nerfstudio layout."""
+"""``transforms*.json``: pictures with a pose and a time each. Shared by the Blender and the nerfstudio layout."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from masiv.errors import InputError
 from masiv.scene.assemble import Conventions, assemble
 from masiv.scene.camera import Camera
 from masiv.scene.declaration import SceneDeclaration
-from masiv.scene.lens import Lens, lens_of
+from masiv.scene.lens import Lens, read_lens
 from masiv.scene.listing import array, entries, mapping, number, read_json, text
-from masiv.scene.pictures import OWN_ALPHA, PLAIN, MaskSource, Pictures, common_size, cuts_out, size
+from masiv.scene.pictures import OWN_ALPHA, PLAIN, MaskSource, Pictures, common_size, has_transparency, image_size
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import TimeGrid, opengl_c2w_to_world_to_camera
 
@@ -25,7 +25,7 @@ SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 
 @dataclass(frozen=True, eq=False)
 class PosedPicture:
-    """One entry of a listing. ``where`` names it in messages; ``time`` below 0 is the empty background of its view."""
+    """One entry of a listing. ``where`` names it in messages; ``time`` [s], negative for an empty background."""
 
     path: Path
     mask: Path | None
@@ -36,7 +36,7 @@ class PosedPicture:
 
     @cached_property
     def signature(self) -> np.ndarray:
-        """What tells two cameras apart, shape (25,), lengths in metres and shares of the picture."""
+        """Pose and intrinsics (25,), to compare cameras. Lengths in metres and in fractions of the picture."""
         scale = max(self.lens.width, self.lens.height)
         intrinsics = self.lens.intrinsics[:2].ravel() / scale
         shape = [self.lens.width, self.lens.height]
@@ -61,17 +61,17 @@ def posed_scene(
     extra: Mapping[str, Sequence[PosedPicture]] | None = None,
     problems: Sequence[str] = (),
 ) -> Scene:
-    """The scene of ``pictures``, whose times make the frames; pictures with the same pose and lens are one view.
+    """The scene of ``pictures``. Their times define the frames; pictures with the same pose and lens are one view.
 
-    ``extra``, by the listing's name: further pictures, which a fit may want to hold out; those between frames are left
-    out. Raises InputError for uneven times and for two pictures of one view at one time.
+    ``extra``: further pictures by the name of their listing, for example test views; those between frames are ignored.
+    Raises InputError for uneven times and for two pictures of one view at one time.
     """
     problems = list(problems)
     observed = [p for p in pictures if p.time >= 0]
     if not observed:
         raise InputError(f"{folder}: no picture has a time of 0 or more")
-    grid = TimeGrid.of_times([p.time for p in observed], [p.where for p in observed], declaration.fps)
-    if declaration.fps is None and looks_normalised([p.time for p in observed]):
+    grid = TimeGrid.from_times([p.time for p in observed], [p.where for p in observed], declaration.fps)
+    if declaration.fps is None and are_normalized([p.time for p in observed]):
         problems.append(
             f"the times run from exactly 0 to 1, as normalised ones do: taken as seconds ({grid.fps:g} fps); "
             "give fps in scene.yaml if they are not"
@@ -101,8 +101,8 @@ def posed_scene(
     )
 
 
-def looks_normalised(times: Sequence[float]) -> bool:
-    """Whether ``times`` run from exactly 0 to exactly 1, as D-NeRF's do whatever the seconds."""
+def are_normalized(times: Sequence[float]) -> bool:
+    """Whether ``times`` run from exactly 0 to exactly 1, as those of D-NeRF, which are not seconds."""
     return min(times) == 0 and max(times) == 1
 
 
@@ -147,12 +147,12 @@ class _Views:
             except InputError as error:
                 raise InputError(f"{first.where}: {error}") from error
             cameras.append(Camera(name, first.lens.width, first.lens.height, intrinsics, first.world_to_camera))
-            if not first.lens.straight:
+            if not first.lens.is_pinhole:
                 lenses[view] = first.lens
             mine = [p.path for key, p in self.at.items() if key[0] == view]
             if not mine:
                 raise InputError(f"{first.where}: its view has only an empty background (a time below 0)")
-            if cuts_out(mine[0]):
+            if has_transparency(mine[0]):
                 cut_out.add(view)
         return Pictures(
             paths={key: picture.path for key, picture in self.at.items()},
@@ -163,7 +163,7 @@ class _Views:
         )
 
     def _name(self, view: int) -> str:
-        """The folder that holds this view's pictures and no other's, else the name of its first picture."""
+        """The folder, if it contains the pictures of this view only, else the name of the first picture."""
         parents = {p.path.parent for p in self.members[view]}
         others = {p.path.parent for v, members in enumerate(self.members) if v != view for p in members}
         if len(self.members) > 1 and len(parents) == 1 and not parents & others:
@@ -191,7 +191,7 @@ def _picture(folder: Path, common: Mapping[str, Any], row: Any, where: str) -> P
     except InputError as error:
         raise InputError(str(error) if where in str(error) else f"{where}: {error}") from error
     mask = _existing(folder, text(row, "mask_path", where), where) if row.get("mask_path") else None
-    return PosedPicture(path, mask, number(row, "time", where), pose, lens_of(row, *size(path), where), where)
+    return PosedPicture(path, mask, number(row, "time", where), pose, read_lens(row, *image_size(path), where), where)
 
 
 def _existing(folder: Path, name: str, where: str) -> Path:

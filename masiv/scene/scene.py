@@ -1,15 +1,16 @@
-"""What was observed: calibrated cameras, frames, and the world around the object."""
+"""Multi-view video of one object: calibrated cameras, frames, masks, gravity and ground."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from masiv.errors import InputError
 from masiv.scene.camera import Camera
+from masiv.scene.frame_cache import Frame, FrameCache
 
 
 @dataclass(frozen=True)
@@ -20,28 +21,18 @@ class Ground:
     height: float
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One picture: image (H, W, 3) uint8 RGB, mask (H, W) float32 in [0, 1], 1 on the object,
-    valid (H, W) bool, False where an occluder hides the scene."""
-
-    image: np.ndarray
-    mask: np.ndarray
-    valid: np.ndarray
-
-
 def _unknown_background(view: int) -> np.ndarray | None:
     return None
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Multi-view video of one object. World axes, metres, seconds.
+    """Multi-view video of one object, in world axes, metres and seconds.
 
-    ``background(view)`` is the picture (H, W, 3) uint8 of the empty scene, or None.
-    ``load(view, frame)`` reads a picture; use ``frame(view, frame)``, which caches and checks the bounds.
-    Frames are integers 0…frame_count-1; times follow as frame / fps. ``fit_frames`` is what scene.yaml
-    asks for, if anything. A missing picture has ``valid`` False everywhere.
+    Frames are 0 … frame_count-1, at the times frame / fps. gravity (3,) [m/s²]; up (3,) unit vector; density [kg/m³].
+    ``load(view, frame)`` reads a picture and keeps those that were read last (``FrameCache``); ``frame(view, frame)``
+    also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
+    hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
     """
 
     path: Path
@@ -59,11 +50,10 @@ class Scene:
     problems: tuple[str, ...] = ()
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
-    _cache: dict = field(default_factory=dict, repr=False, compare=False)
 
-    def __getstate__(self) -> dict:
-        """Without the pictures that were read: another process reads those that it needs."""
-        return {**self.__dict__, "_cache": {}}
+    def __post_init__(self) -> None:
+        if not isinstance(self.load, FrameCache):
+            object.__setattr__(self, "load", FrameCache(self.load))
 
     @property
     def times(self) -> np.ndarray:
@@ -72,20 +62,23 @@ class Scene:
 
     @property
     def views(self) -> tuple[int, ...]:
-        """Indices of the cameras that may be looked at."""
+        """Indices of the cameras that are not held out."""
         return tuple(v for v in range(len(self.cameras)) if v not in self.hidden_views)
 
     def frame(self, view: int, frame: int) -> Frame:
-        """The picture of ``view`` at ``frame``. Raises InputError outside of what this scene may see."""
+        """The picture of ``view`` at ``frame``; ``valid`` is False everywhere if there is none.
+
+        Raises InputError if the frame or the view is held out or does not exist.
+        """
         if not 0 <= frame < self.frame_count or view not in self.views:
-            raise InputError(f"view {view}, frame {frame} of {self.path} is outside of what this stage may see")
-        key = (view, frame)
-        if key not in self._cache:
-            self._cache[key] = self.load(view, frame)
-        return self._cache[key]
+            raise InputError(f"view {view}, frame {frame} of {self.path} is held out from this stage or does not exist")
+        return self.load(view, frame)
 
     def restricted(self, fit_frames: int | None = None, holdout_cameras: tuple[int, ...] = ()) -> Scene:
-        """The part of the scene that a fit may see: the first ``fit_frames`` frames, without the held-out cameras."""
+        """The first ``fit_frames`` frames (None: all) without ``holdout_cameras``: the training data of a fit.
+
+        Raises InputError if fewer than two frames or no camera are left, or a camera does not exist.
+        """
         count = self.frame_count if fit_frames is None else fit_frames
         if not 2 <= count <= self.frame_count:
             raise InputError(

@@ -1,10 +1,10 @@
 """The real captures of Spring-Gaus (Zhong et al., ECCV 2024): ``real_capture/``, three cameras at 120 frames a second.
 
-Below ``dynamic/``: ``cameras_calib.json`` has {rvecs, tvecs} a camera (OpenCV, world to camera);
-``sequences/<object>/<n>.json`` the pictures of each camera, which are ``videos_images/<camera>/…jpg`` with masks
+Below ``dynamic/``: ``cameras_calib.json`` contains {rvecs [rad], tvecs [m]} of each camera (OpenCV, world to camera);
+``sequences/<object>/<n>.json`` lists the pictures of each camera, ``videos_images/<camera>/…jpg`` with masks
 ``videos_masks/<camera>/…png``. The focal length is that of ``static/colmap/<object>/cameras.bin``, scaled to the
-pictures, the principal point their centre. World: metres, gravity (0, 0, +9.8), so up is −z, ground z = −0.025.
-The static pictures are not used: their world is another one.
+pictures; the principal point is their centre. World: metres, gravity (0, 0, +9.8) m/s², up −z, ground z = −0.025 m.
+The static pictures are not used: they have other world axes.
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ from masiv.errors import InputError
 from masiv.scene.assemble import Conventions, assemble
 from masiv.scene.camera import Camera
 from masiv.scene.colmap import ColmapCamera, read_pinhole
-from masiv.scene.declaration import SceneDeclaration
+from masiv.scene.declaration import read_declaration
+from masiv.scene.layout import Layout
 from masiv.scene.listing import array, entries, mapping, read_json
 from masiv.scene.pictures import PLAIN, MaskSource, Pictures, common_size
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import rotation_vector_to_world_to_camera
 
-LOOKED_FOR = "dynamic/cameras_calib.json, or a folder or file below its dynamic/sequences"
 CONVENTIONS = Conventions(up="-z", ground_height=0.025)  # height is along up
 FPS = 120.0
 VECTORS = ((3,), (3, 1), (1, 3))
 
 
-def recognises(path: Path) -> bool:
+def can_read(path: Path) -> bool:
     """Whether ``path`` is the root of this layout, the folder of an object's sequences, or a sequence's file."""
     return _root(path) is not None
 
 
-def read(path: Path, declaration: SceneDeclaration) -> Scene:
+def read(path: Path) -> Scene:
     """The one sequence at ``path``. Raises InputError where there are several, or files are unusable."""
     root = _root(path)
     assert root is not None
     sequence = _sequence(path, root)
+    declaration = read_declaration(path.parent if path.is_file() else path)
     calibration = root / "dynamic" / "cameras_calib.json"
     poses = mapping(read_json(calibration), str(calibration))
     listed = mapping(read_json(sequence), str(sequence))
@@ -116,3 +117,8 @@ def _picture(folder: Path, row: Any, where: str) -> Path:
 def _mask_source(dynamic: Path, picture: Path) -> MaskSource:
     mask = (dynamic / "videos_masks" / picture.relative_to(dynamic / "videos_images")).with_suffix(".png")
     return MaskSource("mask", "mask pictures videos_masks/…png", mask) if mask.is_file() else PLAIN
+
+
+LAYOUT = Layout(
+    "Spring-Gaus real", "dynamic/cameras_calib.json, or a folder or file below its dynamic/sequences", can_read, read
+)

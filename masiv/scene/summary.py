@@ -1,4 +1,4 @@
-"""A scene in numbers, for ``masiv inspect`` and for run folders."""
+"""Summary of a scene for ``masiv inspect``, and its identity for run folders."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from masiv.scene.scene import Scene
 
 
 def identity(scene: Scene) -> dict[str, Any]:
-    """What tells two scenes apart: conventions, a digest of the cameras and one of the first and last picture."""
+    """Identity of a scene: conventions, a hash of the cameras and one of the first and the last picture."""
     cameras, pictures = hashlib.sha256(), hashlib.sha256()
     for camera in scene.cameras:
         cameras.update(np.round([*camera.intrinsics.ravel(), *camera.world_to_camera.ravel()], 6).tobytes())
@@ -38,7 +38,7 @@ def identity(scene: Scene) -> dict[str, Any]:
 
 
 def summarise(scene: Scene) -> dict[str, Any]:
-    """Everything that ``masiv inspect`` says. Reads every picture; those that show nothing become problems."""
+    """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem."""
     problems = list(scene.problems)
     coverage = np.zeros((len(scene.views), scene.frame_count))
     seen = np.zeros(coverage.shape, bool)
@@ -78,7 +78,7 @@ def summarise(scene: Scene) -> dict[str, Any]:
 
 
 def as_text(summary: dict[str, Any]) -> str:
-    """``summarise``'s answer for a person."""
+    """The result of ``summarise`` as text."""
 
     def numbers(values: list[float]) -> str:
         return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

@@ -1,4 +1,4 @@
-"""Every change of axes and of time. Conventions: docs/conventions.md."""
+"""Transformations of axes and of time. Conventions: docs/conventions.md."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def rotation_vector_to_world_to_camera(rotation: np.ndarray, translation: np.nda
 
 @dataclass(frozen=True)
 class TimeGrid:
-    """Frames at even times: frame k is at ``first + k step`` [in the unit of the times that made it].
+    """Frames at even times: frame k is at ``first + k step``, in the unit of the times that it was made from.
 
-    ``fps``: frames per second. ``tolerance``: how far a time may be from its frame, in frames.
+    ``fps``: frames per second. ``tolerance``: largest distance of a time from its frame [frames].
     """
 
     first: float
@@ -58,24 +58,24 @@ class TimeGrid:
     tolerance: float
 
     def frame(self, time: float) -> int | None:
-        """The frame at ``time``, or None where it is between two frames or outside."""
+        """The frame at ``time``, or None if that is between two frames or outside of the grid."""
         position = (time - self.first) / self.step
         k = round(position)
         return k if 0 <= k < self.count and abs(position - k) <= self.tolerance else None
 
     @classmethod
-    def of_times(cls, times: Sequence[float], names: Sequence[str], fps: float | None = None) -> TimeGrid:
-        """The grid that all ``times`` [s] lie on; ``names`` are those of the pictures, for messages.
+    def from_times(cls, times: Sequence[float], names: Sequence[str], fps: float | None = None) -> TimeGrid:
+        """The grid of ``times`` [s]; ``names`` are those of their pictures, for messages.
 
-        Even within 1 % of a frame. A declared ``fps`` decides how long a frame lasts, whatever the unit of the times,
-        which may then be rounded (25 %). Raises InputError, naming a picture, for times that are not even.
+        Times must be even within 1 % of a frame. If ``fps`` is declared, the times can have any unit and can be rounded
+        (25 % of a frame). Raises InputError that names a picture for times that are not even.
         """
         order = np.argsort(times, kind="stable")
         ordered = np.asarray(times, np.float64)[order]
         gaps: np.ndarray = np.diff(ordered)
         if not len(gaps) or gaps.max() <= 0:
             raise InputError(f"{names[0]}: all pictures have the same time, a motion needs two or more")
-        # Pictures of one instant may differ by jitter: a new instant begins after a gap.
+        # Times of one instant can differ by jitter: a new instant begins after a gap.
         starts: np.ndarray = np.concatenate([[0], 1 + np.flatnonzero(gaps > 0.025 * gaps.max())]).astype(int)
         instants = np.array([np.median(group) for group in np.split(ordered, starts[1:])])
         spacing: np.ndarray = np.diff(instants)
@@ -101,31 +101,25 @@ class TimeGrid:
                 f"no view has a picture at frame {index[gap] + 1}, between {before} and {after}: "
                 "frames must run without gaps"
             )
-        rate = fps or whole_if_near(1 / step)
+        rate = fps or round_if_close(1 / step)
         return cls(float(first), float(step), len(instants), float(rate), tolerance)
 
 
-def whole_if_near(fps: float) -> float:
-    """``fps``, as a whole number where that agrees to 0.1 %: times are written with few digits."""
+def round_if_close(fps: float) -> float:
+    """``fps``, rounded to an integer if that changes it by less than 0.1 %: files give times with few digits."""
     return float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else float(fps)
 
 
 def frame_of_time(time: float, fps: float) -> int:
-    """The frame at ``time`` [s]. Rounds: truncation is one frame early at k = 5, 7, 10… for 24 fps in float32."""
+    """The frame at ``time`` [s], rounded: truncation is one frame early at k = 5, 7, 10 … for 24 fps in float32."""
     return round(float(time) * fps)
-
-
-def time_of_frame(frame: int, fps: float) -> float:
-    """The time [s] of ``frame``."""
-    return frame / fps
 
 
 @dataclass(frozen=True)
 class SimulationFrame:
     """The simulator's axes: +y up, ground plane at y = 0. x_simulation = rotation x_world + translation.
 
-    rotation: (3, 3) float64, translation: (3,) float64 [m]. Methods take (..., 3) arrays and keep their shape and
-    float type.
+    rotation: (3, 3) float64, translation: (3,) float64 [m]. Methods take arrays (..., 3) and keep shape and float type.
     """
 
     rotation: np.ndarray
@@ -133,7 +127,7 @@ class SimulationFrame:
 
     @classmethod
     def from_scene(cls, up: np.ndarray, ground: Ground | None) -> SimulationFrame:
-        """The smallest rotation that takes the ground's normal (``up`` where there is no ground) to +y."""
+        """The smallest rotation that maps the ground's normal (``up`` without a ground) to +y. Raises InputError."""
         axis = np.asarray(up if ground is None else ground.normal, dtype=np.float64)
         length = np.linalg.norm(axis)
         if not np.isfinite(length) or length < 1e-12:
@@ -168,7 +162,7 @@ def _rotation_to_y(unit: np.ndarray) -> np.ndarray:
     target = np.array([0.0, 1.0, 0.0])
     cosine = float(unit @ target)
     if cosine < -1.0 + 1e-4:
-        # The smallest rotation is not unique at −y and ill-conditioned near it: half a turn about x, then the rest.
+        # At −y the smallest rotation is not unique, and near it ill-conditioned: first half a turn about x.
         half_turn = np.diag([1.0, -1.0, -1.0])
         return _rotation_to_y(half_turn @ unit) @ half_turn
     cross = np.cross(unit, target)

@@ -1,7 +1,7 @@
-"""A twin changed into one that was never filmed: another body, density or ground, fewer effects.
+"""A twin in a situation that was never observed: another body, density or ground, fewer effects.
 
-Effects stay. Their accelerations are those of any mass, their places stay where they are in the world: under another
-body the same place is another part of it, and lowering the ground leaves them at their height.
+Effects stay. Their accelerations do not depend on the mass. Their places stay fixed in the world: in another body the
+same place is another part of it, and over a lower ground they keep their height.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +16,7 @@ from masiv.errors import InputError
 from masiv.mpm.design import grid_spacing
 from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame
-
-if TYPE_CHECKING:
-    from masiv.twin import Twin, TwinEffect
+from masiv.twin import Twin, TwinEffect
 
 
 def without_effects(twin: Twin, names: tuple[str, ...]) -> Twin:
@@ -35,20 +32,21 @@ def with_density(twin: Twin, density: float) -> Twin:
     """``twin`` with another density [kg/m^3]; its moduli stay. Raises InputError."""
     if not (math.isfinite(density) and density > 0):
         raise InputError(f"--density {density:g}: give a density above 0 kg/m³")
-    return replace(twin, density=float(density))
+    return twin.with_body(density=float(density))
 
 
 def with_ground(twin: Twin, ground: str) -> Twin:
-    """``twin`` over another ground: 'none', or a height [m] along the ground's normal (up, where it had no ground).
+    """``twin`` over another ground: 'none', or a height [m] along the ground's normal (along up if it had no ground).
 
-    It is where it is put: an effect that raises the ground is left out. Raises InputError for anything else, and for a
-    ground that the body would stand in.
+    The height is final: an effect that raises the ground is left out. Raises InputError for anything else, and for a
+    ground that the body would intersect.
     """
     normal = _up(twin)
     before = 0.0 if twin.ground is None else twin.ground.height
     if ground.strip().lower() == "none":
-        # The normal stays the vertical of the simulation, in whose axes effects are.
-        return replace(twin, ground=None, contact="none", up=normal, effects=_over_new_ground(twin.effects, before))
+        # The normal stays the vertical of the simulation frame, in which effects are given.
+        changed = replace(twin, up=normal, effects=_over_new_ground(twin.effects, before))
+        return changed.with_boundary(ground=None, contact="none")
     try:
         height = float(ground)
     except ValueError:
@@ -60,35 +58,36 @@ def with_ground(twin: Twin, ground: str) -> Twin:
         raise InputError(f"--ground {ground}: the body reaches down to {lowest:.3g} m, give a lower ground")
     contact = "sticky" if twin.contact == "none" else twin.contact
     effects = _over_new_ground(twin.effects, before - height)
-    return replace(twin, ground=Ground(normal, height), contact=contact, effects=effects)
+    return replace(twin, effects=effects).with_boundary(ground=Ground(normal, height), contact=contact)
 
 
 def with_body_of(twin: Twin, other: Twin) -> tuple[Twin, np.ndarray]:
-    """``twin`` with the particles and the volume of ``other``, and the shift (3,) [m] that put them in its place.
+    """``twin`` with the particles and the volume of ``other``, and the shift (3,) [m] that they were moved by.
 
-    Sizes stay; the boxes' middles are one above the other and their lowest points at one height.
+    Sizes stay. The centre of the bounding box lies above or below the old one, the lowest point at the old height.
     """
     shift = _place(twin, other.positions.astype(np.float64))
     positions = (other.positions + shift).astype(np.float32)
-    return replace(twin, positions=positions, volume=other.volume), shift
+    return twin.with_body(particles=positions, volume=other.volume), shift
 
 
 def with_mesh(twin: Twin, mesh: Path) -> Twin:
-    """``twin`` with a watertight mesh filled with about as many particles, y of the mesh up.
+    """``twin`` with a watertight mesh, y up, filled with about as many particles.
 
-    A mesh says nothing of its unit, so its longest side is made the body's own; it takes the body's place as in
-    ``with_body_of``. Raises InputError for a mesh that cannot be filled.
+    A mesh file has no unit, so the mesh is scaled to the longest side of the body. It is placed as in ``with_body_of``.
+    Raises InputError for a mesh that cannot be filled.
     """
     from masiv.shapes import ShapeSpec, make_body
 
     axes = SimulationFrame.from_scene(twin.up, twin.ground)
     size = float(np.ptp(axes.points_to_simulation(twin.positions.astype(np.float64)), axis=0).max())
-    body = make_body(ShapeSpec(kind="mesh", mesh=mesh, size=size), len(twin.positions))
+    spec = ShapeSpec.model_validate({"kind": "mesh", "mesh": mesh, "size": size})
+    body = make_body(spec, len(twin.positions))
     if len(body.particles) < 8:
         raise InputError(f"{mesh} is too thin to be filled with about {len(twin.positions)} particles")
     particles = axes.points_to_world(body.particles)
     particles = particles + _place(twin, particles)
-    return replace(twin, positions=particles.astype(np.float32), volume=float(body.volume))
+    return twin.with_body(particles=particles.astype(np.float32), volume=float(body.volume))
 
 
 def _up(twin: Twin) -> np.ndarray:
@@ -106,7 +105,7 @@ def _over_new_ground(effects: tuple[TwinEffect, ...], lift: float) -> tuple[Twin
 
 
 def _place(twin: Twin, positions: np.ndarray) -> np.ndarray:
-    """The shift (3,) [m] that puts the box of ``positions`` (N, 3) where the twin's body stands."""
+    """The shift (3,) [m] that moves the bounding box of ``positions`` (N, 3) to that of the twin's body."""
     up = _up(twin)
     here = twin.positions.astype(np.float64)
     middle = 0.5 * (here.min(0) + here.max(0) - positions.min(0) - positions.max(0))

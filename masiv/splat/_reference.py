@@ -1,4 +1,4 @@
-"""The rasteriser's twin in plain torch, float64, without tiles: what masiv/splat/rasteriser.py is tested against."""
+"""Reference of masiv/splat/rasteriser.py in plain torch, float64, without tiles; the tests compare the two."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def _render(
     colours: torch.Tensor,
     background: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """rgb (H, W, 3), alpha (H, W), depth (H, W), as ``render``; memory N H W. Kerbl et al. 2023, eq. 2, 5, 6."""
+    """rgb (H, W, 3), alpha (H, W), depth (H, W), as ``render``; memory N H W. Kerbl et al. 2023, eq. 3, 5, 6."""
     pose = torch.as_tensor(camera.world_to_camera, dtype=torch.float64)
     intrinsics = torch.as_tensor(camera.intrinsics, dtype=torch.float64)
     points = means @ pose[:3, :3].T + pose[:3, 3]

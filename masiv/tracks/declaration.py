@@ -34,8 +34,10 @@ class HalfSpaceDeclaration(_Part):
 
 
 class ClampDeclaration(_Part):
-    """What is held. ``half_space`` or ``box`` (two opposite corners) in the geometry's own axes and units; ``markers``:
-    those fixed to the clamp, which do not move with the material."""
+    """The clamped region: ``half_space`` or ``box`` (two opposite corners), in the axes and units of the geometry.
+
+    ``markers``: those fixed to the clamp, which do not move with the material.
+    """
 
     half_space: HalfSpaceDeclaration | None = None
     box: tuple[Vector, Vector] | None = None
@@ -49,13 +51,15 @@ class ClampDeclaration(_Part):
 
 
 class GeometryDeclaration(_Part):
-    """The body at rest: one of ``mesh`` (a watertight STL, OBJ, PLY; relative to the scene), ``box`` (its three sides),
-    ``sphere`` (its diameter) and ``cylinder``; a primitive's origin is its middle. ``units`` are those of all numbers
-    here but ``position``, of the mesh file and of the clamp.
+    """The shape of a body at rest and its placement in the world.
 
-    Where it is in the world: ``markers_at`` says where markers sit on it (one: it is moved there; three or more: the
-    best rigid motion onto their rest positions); or ``position`` [m] of its origin. ``rotation_deg`` about the fixed
-    axes x, then y, then z.
+    Shape: one of ``mesh`` (a watertight STL, OBJ or PLY, relative to the scene), ``box`` (three sides), ``sphere``
+    (diameter) and ``cylinder``. The origin of a primitive is its centre. ``units`` are those of the mesh file, of the
+    clamp, and of all numbers here except ``position``.
+
+    Placement: ``markers_at``, positions of markers on the body (one: the body is translated; three or more: the best
+    rigid motion to their rest positions); or ``position`` [m] of its origin. ``rotation_deg`` [°] about the fixed axes
+    x, then y, then z.
     """
 
     units: Unit
@@ -82,8 +86,11 @@ class GeometryDeclaration(_Part):
 
 
 class BodyDeclaration(_Part):
-    """One object. ``density`` [kg/m³] or ``mass`` [kg]. ``group``: bodies of a group share the laws of their
-    surroundings (a drag of balls, say); alone by default."""
+    """One object.
+
+    ``density`` [kg/m³] or ``mass`` [kg]. ``group``: bodies of a group share the effects of their environment, for
+    example drag; by default a body is its own group.
+    """
 
     geometry: GeometryDeclaration | None = None
     density: Positive | None = None
@@ -102,7 +109,7 @@ class BodyDeclaration(_Part):
 
 
 class ColumnsDeclaration(_Part):
-    """Names of a CSV's columns. ``markers``: marker -> axis -> column; an axis that was not measured is left out."""
+    """Names of a CSV's columns. ``markers``: marker -> axis -> column, without the axes that were not measured."""
 
     time: str | None = None
     markers: dict[str, dict[Axis, str]]
@@ -116,13 +123,17 @@ class ColumnsDeclaration(_Part):
 
 
 class RunDeclaration(_Part):
-    """One recording. ``file``: CSV or C3D, relative to the scene. ``select``: only the rows whose columns have these
-    values. ``use``: fit on it, or hold it out. ``condition``: runs of a condition share what was done to the body (a
-    load, a wind). ``markers``: keep only these. ``rest_frames`` [first, last): the body is held at rest there;
-    ``release_time`` [s, the file's]: it is let go, found in the data where it is left out. ``time`` [s]: use only from
-    the first to the second. ``unsteady`` [s]: how long after its release a run is not compared with the model, for
-    what lets go is not in it (a hand that follows, a thread that is slack at first); then how far the body was held up
-    and an effective start are fitted as well."""
+    """One recording.
+
+    ``file``: CSV or C3D, relative to the scene. ``select``: only the rows whose columns have these values. ``markers``:
+    only these. ``time`` [s]: first and last time that is used.
+    ``use``: `fit` for training, `hold_out` for evaluation only. ``condition``: runs with the same name have the same
+    treatment of the body, for example a load or a wind.
+    ``rest_frames`` [first, last): frames in which the body is held at rest. ``release_time`` [s, as in the file]: by
+    default it is estimated. ``ignore_after_release`` [s]: the run is not compared with the model for this
+    long, because the model does not contain what releases the body (a hand that follows, a slack thread). Then the
+    initial height and an effective initial state are fitted too. Its earlier name is ``unsteady``.
+    """
 
     file: Path
     name: str | None = None
@@ -133,8 +144,17 @@ class RunDeclaration(_Part):
     markers: tuple[str, ...] | None = None
     rest_frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = None
     release_time: FiniteFloat | None = None
-    unsteady: Annotated[FiniteFloat, Field(ge=0)] = 0.0
+    ignore_after_release: Annotated[FiniteFloat, Field(ge=0)] = 0.0
     time: tuple[FiniteFloat, FiniteFloat] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _earlier_name(cls, values: object) -> object:
+        if isinstance(values, dict) and "unsteady" in values:
+            if "ignore_after_release" in values:
+                raise ValueError("unsteady is the earlier name of ignore_after_release: give one of them")
+            return {"ignore_after_release" if key == "unsteady" else key: value for key, value in values.items()}
+        return values
 
     @model_validator(mode="after")
     def _ordered(self) -> RunDeclaration:
@@ -146,12 +166,11 @@ class RunDeclaration(_Part):
 
 
 class TracksDeclaration(_Part):
-    """Keys of the ``scene.yaml`` of tracks; ``layout: tracks`` is what it is known by.
+    """Keys of the ``scene.yaml`` of tracks, with ``layout: tracks``.
 
-    units: of positions in the files, where they do not say it (a CSV by columns such as tip_x_mm). rate [Hz]: where
-    files have no time. up_axis (z by default), gravity (9.8 down by default), ground (none by default): as of a scene
-    of pictures. medium_density [kg/m³] and
-    medium_viscosity [Pa s]: of what bodies move through, air at 20 °C by default.
+    units: of positions, if the files do not give them (a CSV gives them by names of columns such as tip_x_mm). rate
+    [Hz]: if the files have no times. up_axis (default z), gravity (default 9.8 m/s² along −up), ground (default none):
+    as for video. medium_density [kg/m³], medium_viscosity [Pa s]: of the surrounding medium, by default air at 20 °C.
     """
 
     layout: Literal["tracks"]
@@ -171,6 +190,6 @@ class TracksDeclaration(_Part):
     def _plus_sign(cls, value: object) -> object:
         return value.strip().lstrip("+") if isinstance(value, str) else value
 
-    def surroundings(self) -> SceneDeclaration:
-        """Up axis, gravity and ground, with the functions that read them."""
+    def environment(self) -> SceneDeclaration:
+        """Up axis, gravity and ground, with the functions that evaluate them."""
         return SceneDeclaration(up_axis=self.up_axis, gravity=self.gravity, ground=self.ground)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from masiv.errors import InputError
+from masiv.errors import InputError, MasivError
 from masiv.mesh import read_mesh
 from masiv.tracks.declaration import METRES, GeometryDeclaration
 
@@ -85,3 +85,23 @@ def make_geometry(declared: GeometryDeclaration, folder: Path) -> Geometry:
 
 def _primitive(kind: str, mesh, volume: float, half: np.ndarray) -> Geometry:
     return Geometry(kind, np.array(mesh.vertices, np.float64), np.array(mesh.faces), volume, -half, half)
+
+
+def fill_geometry(geometry: Geometry, spacing: float) -> np.ndarray:
+    """Particles (N, 3) [m, own axes] about ``spacing`` [m] apart: the middles of cells that divide the bounding box
+    evenly, where they are inside. Each stands for volume / N. Raises MasivError where fewer than 8 are."""
+    counts = np.maximum(np.rint((geometry.upper - geometry.lower) / spacing).astype(int), 1)
+    centres, inside = geometry.lattice_inside(counts)
+    if inside.sum() < 8:
+        raise MasivError(f"the body is thinner than the particle spacing {1e3 * spacing:.2g} mm: choose a smaller one")
+    return centres[inside]
+
+
+def mean_diameter(geometry: Geometry) -> float:
+    """Of the sphere [m] with the frontal area that a convex body shows on the average, a quarter of its surface (Cauchy
+    1841); a sphere's own."""
+    if geometry.kind == "sphere":
+        return geometry.size
+    a, b, c = (geometry.vertices[geometry.faces[:, k]] for k in range(3))
+    surface = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return math.sqrt(surface / math.pi)

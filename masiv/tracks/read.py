@@ -1,4 +1,7 @@
-"""``read_tracks``: a scene.yaml with ``layout: tracks`` and the files beside it. Light: no torch, no taichi."""
+"""The layout of tracks: a ``scene.yaml`` with ``layout: tracks``, and CSV or C3D files of marker positions.
+
+Positions are in m, cm or mm, converted to metres; times in seconds; gaps are NaN. Light: no torch, no taichi.
+"""
 
 from __future__ import annotations
 
@@ -9,30 +12,31 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
+from masiv.scene.layout import Layout
 from masiv.strict import read_yaml, validated
 from masiv.tracks.declaration import METRES, BodyDeclaration, RunDeclaration, TracksDeclaration
 from masiv.tracks.geometry import Geometry, make_geometry
 from masiv.tracks.placement import Placement, best_rigid
-from masiv.tracks.release import found_release
+from masiv.tracks.release import estimate_release
 from masiv.tracks.table import Table, read_table
-from masiv.tracks.tracks import Body, Clamp, Run, Tracks, rest_of
-
-LOOKED_FOR = "scene.yaml with layout: tracks"
+from masiv.tracks.tracks import Body, Clamp, Run, Tracks, rest_positions
 
 
-def recognises(folder: Path) -> bool:
+def can_read(folder: Path) -> bool:
     """Whether ``folder`` is a scene of tracks."""
     path = folder / "scene.yaml"
     return path.is_file() and read_yaml(path).get("layout") == "tracks"
 
 
 def read_tracks(folder: Path) -> Tracks:
-    """The tracks in ``folder``. Raises InputError for an unknown key, a bad value or a file that cannot be used; lesser
-    troubles are in ``problems``."""
+    """The tracks in ``folder``. Raises InputError for an unknown key, a bad value or a file that cannot be used.
+
+    Lesser defects are in ``problems``.
+    """
     where = folder / "scene.yaml"
     declared = validated(TracksDeclaration, read_yaml(where), str(where))
-    surroundings = declared.surroundings()
-    up = surroundings.up("z")
+    environment = declared.environment()
+    up = environment.up("z")
     bodies = {name: _body(name, body, folder) for name, body in declared.bodies.items()}
     problems: list[str] = []
     runs = tuple(_run(run, declared, bodies, folder, problems) for run in declared.runs)
@@ -48,8 +52,8 @@ def read_tracks(folder: Path) -> Tracks:
     return Tracks(
         path=folder,
         up=up,
-        gravity=surroundings.gravity_vector(up, 9.8),
-        ground=surroundings.ground_plane(up, None),
+        gravity=environment.gravity_vector(up, 9.8),
+        ground=environment.ground_plane(up, None),
         bodies=bodies,
         runs=runs,
         problems=tuple(problems),
@@ -91,15 +95,15 @@ def _clamp(name: str, body: BodyDeclaration, geometry: Geometry) -> Clamp | None
     touched, slack = geometry.vertices, 1e-6 * geometry.size
     if not Clamp(normals, heights + slack, ()).holds(touched).any():
         raise InputError(
-            f"scene.yaml: bodies.{name}.clamp holds no part of the geometry, which spans {_box(geometry)} m in its own "
-            "axes: correct its numbers"
+            f"scene.yaml: bodies.{name}.clamp holds no part of the geometry, which spans {_extent(geometry)} m in "
+            "its own axes: correct its numbers"
         )
     if clamp.holds(touched).all():
         raise InputError(f"scene.yaml: bodies.{name}.clamp holds the whole body: nothing is free to move")
     return clamp
 
 
-def _box(geometry: Geometry) -> str:
+def _extent(geometry: Geometry) -> str:
     return " × ".join(f"{low:.4g}…{high:.4g}" for low, high in zip(geometry.lower, geometry.upper, strict=True))
 
 
@@ -113,7 +117,7 @@ def _run(
     if body not in bodies or (run.body is None and len(bodies) > 1):
         raise InputError(f"scene.yaml: {where}: say which body it is of: one of {', '.join(bodies)}")
     table = read_table(folder / run.file, declared.columns, run.select)
-    markers, positions = _kept(where, run, table)
+    markers, positions = _select_markers(where, run, table)
     positions = positions * _unit(where, table, declared, problems)
     times, rate = _times(where, table, declared, problems)
     if table.ignored:
@@ -136,23 +140,23 @@ def _run(
         raise InputError(
             f"scene.yaml: {where}: release_time {run.release_time:g} is outside of {times[0]:g} to {times[-1]:g} s"
         )
-    at_rest, noise = rest_of(positions, rest)
+    at_rest, noise = rest_positions(positions, rest)
     for m, marker in enumerate(markers):
         if np.isnan(at_rest[m][np.isfinite(positions[:, m]).any(axis=0)]).any():
             problems.append(f"{where}: marker {marker} is not seen at rest, so it is not tied to the body")
     release = run.release_time
     if rest is not None and noise is not None and release is None:
         free = [m for m, marker in enumerate(markers) if not (clamped and marker in clamped.markers)]
-        release = found_release(times, positions[:, free], rest, at_rest[free], noise[free])
+        release = estimate_release(times, positions[:, free], rest, at_rest[free], noise[free])
         if release is None:
             problems.append(f"{where}: it never leaves its rest position by more than the noise: no release found")
     made = Run(name, body, run.condition, run.use, markers, times, positions, rate, rest, at_rest, noise, release, None,
-               run.unsteady)  # fmt: skip
+               run.ignore_after_release)  # fmt: skip
     made = replace(made, placement=_placement(where, made, declared.bodies[body], problems))
     return made if run.time is None else made.between(*run.time)
 
 
-def _kept(where: str, run: RunDeclaration, table: Table) -> tuple[tuple[str, ...], np.ndarray]:
+def _select_markers(where: str, run: RunDeclaration, table: Table) -> tuple[tuple[str, ...], np.ndarray]:
     if run.markers is None:
         return table.markers, table.positions
     for marker in run.markers:
@@ -164,7 +168,7 @@ def _kept(where: str, run: RunDeclaration, table: Table) -> tuple[tuple[str, ...
 
 
 def _unit(where: str, table: Table, declared: TracksDeclaration, problems: list[str]) -> float:
-    """Metres in a unit of the file. What scene.yaml says wins."""
+    """Metres per unit of the file. A unit in scene.yaml takes precedence."""
     if declared.units is None and table.unit is None:
         raise InputError(f"scene.yaml: {where}: its file does not say its unit: give `units: m`, cm or mm")
     if declared.units is not None and table.unit not in (None, declared.units):
@@ -215,7 +219,7 @@ def _placement(where: str, run: Run, body: BodyDeclaration, problems: list[str])
     own = METRES[declared.units] * np.array([declared.markers_at[marker] for marker in markers])
     world = run.at_rest[[run.marker(marker) for marker in markers]]
     if len(markers) == 1:
-        # An axis that was not measured is 0: the scene has no other origin for it.
+        # An axis that was not measured is 0: its origin is arbitrary.
         return Placement(turn, np.where(run.axes[run.marker(markers[0])], world[0], 0.0) - turn @ own[0])
     if not np.isfinite(world).all():
         raise InputError(
@@ -235,3 +239,6 @@ def _placement(where: str, run: Run, body: BodyDeclaration, problems: list[str])
             " rigid motion: check their order and units"
         )
     return placement
+
+
+LAYOUT = Layout("tracks", "scene.yaml with layout: tracks", can_read, read_tracks)

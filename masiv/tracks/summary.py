@@ -1,4 +1,4 @@
-"""Tracks in numbers and in a picture, for ``masiv inspect``. Light: no torch, no taichi."""
+"""Summary and plot of tracks for ``masiv inspect``. Light: no torch, no taichi."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def identity(tracks: Tracks) -> dict[str, Any]:
         "bodies": list(tracks.bodies),
         "runs": [
             f"{run.name}: {run.purpose}, {len(run.times)} frames"
-            + (f" from {run.unsteady:g} s" if run.unsteady else "")
+            + (f" from {run.ignore_after_release:g} s" if run.ignore_after_release else "")
             for run in tracks.runs
         ],
         "up": tracks.up.tolist(),
@@ -108,7 +108,7 @@ def _travel(run: Run) -> float:
 
 
 def tracks_as_text(summary: dict[str, Any]) -> str:
-    """``summarise_tracks``'s answer for a person."""
+    """The result of ``summarise_tracks`` as text."""
 
     def numbers(values: list[float], scale: float = 1.0) -> str:
         return "(" + ", ".join(f"{scale * value:.4g}" for value in values) + ")"
@@ -149,7 +149,7 @@ def tracks_as_text(summary: dict[str, Any]) -> str:
             f"{run['duration_s']:.3g} s; {len(run['markers'])} markers ({run['axes']}), {missing}; "
             f"travel {distance(run['travel_mm'])}"
             + ("" if run["noise_mm"] is None else f"; noise {run['noise_mm']:.2g} mm")
-            + ("" if run["release_s"] is None else f"; let go at {run['release_s']:.4g} s")
+            + ("" if run["release_s"] is None else f"; released at {run['release_s']:.4g} s")
             + ("" if not run["placement_error_mm"] else f"; placed within {run['placement_error_mm']:.2g} mm")
             + (f"; {run['condition']}" if run["condition"] else "")
         )

@@ -22,8 +22,11 @@ _TIME = re.compile(r"^(time|t)(?:[ _]?[\[(]?(?P<unit>s|ms)[\])]?)?$", re.IGNOREC
 
 @dataclass(frozen=True)
 class Table:
-    """A file as it is: positions (T, M, 3) in ``unit`` (None: the file does not say), NaN where nothing was measured;
-    times (T,) [s] or None; rate [Hz] or None; ignored: columns that are not positions."""
+    """The content of a file.
+
+    positions (T, M, 3) in ``unit`` (None: the file does not give it), NaN for a gap; times (T,) [s] or None; rate [Hz]
+    or None; ignored: columns that are not positions.
+    """
 
     markers: tuple[str, ...]
     positions: np.ndarray
@@ -34,7 +37,7 @@ class Table:
 
 
 def read_table(path: Path, columns: ColumnsDeclaration | None, select: Mapping[str, str | int | float]) -> Table:
-    """The points in ``path``, by its ending. Raises InputError where it cannot be read."""
+    """The points of a CSV or C3D file. Raises InputError if it cannot be read."""
     ending = path.suffix.lower()
     if not path.is_file():
         raise InputError(f"{path} does not exist: correct runs.file in scene.yaml")
@@ -48,7 +51,10 @@ def read_table(path: Path, columns: ColumnsDeclaration | None, select: Mapping[s
 
 
 def read_csv(path: Path, columns: ColumnsDeclaration | None, select: Mapping[str, str | int | float]) -> Table:
-    """One header row; columns named ``columns``, or such as ``tip1_x_m`` and ``time_s``. An empty cell is a gap."""
+    """Points of a CSV file with one header row. An empty cell is a gap. Raises InputError.
+
+    Columns are declared by ``columns``, or have names such as ``tip1_x_m`` and ``time_s``.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = [row for row in csv.reader(file) if row]
@@ -87,7 +93,7 @@ def read_csv(path: Path, columns: ColumnsDeclaration | None, select: Mapping[str
 
 
 def read_c3d(path: Path) -> Table:
-    """Points of a C3D file. A negative residual marks a gap. Raises InputError for a file that is none."""
+    """Points of a C3D file. A negative residual marks a gap. Raises InputError if it cannot be read."""
     import c3d
 
     try:

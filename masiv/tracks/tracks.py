@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +12,9 @@ from masiv.errors import InputError
 from masiv.scene.scene import Ground
 from masiv.tracks.geometry import Geometry
 from masiv.tracks.placement import Placement
+
+MIN_SEEN_SHARE, MIN_SEEN_FRAMES = 0.5, 6
+"""Of the frames after a release, those that must show all markers."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,11 @@ class Body:
     poissons_ratio: float | None
     clamp: Clamp | None
 
+    def free_markers(self, run: Run) -> tuple[int, ...]:
+        """Markers of ``run`` that are not fixed to the clamp and are known at rest in all three axes."""
+        held = () if self.clamp is None else self.clamp.markers
+        return tuple(m for m, name in enumerate(run.markers) if name not in held and np.isfinite(run.at_rest[m]).all())
+
 
 @dataclass(frozen=True)
 class Run:
@@ -49,7 +58,7 @@ class Run:
     or hold_out; rest: frames at rest before the release; at_rest (M, 3): where markers are then (in the first frame
     that shows them, without rest frames), NaN for what was not measured; noise_std (M, 3): standard deviation of each
     axis at rest (None: without two rest frames); release [s]: when the body is let go (None: not known); placement: the
-    body's own axes -> world at rest (None: no geometry); unsteady [s]: how long after the release it is not compared.
+    body's own axes -> world at rest (None: no geometry); ignore_after_release [s]: not compared for this long.
     """
 
     name: str
@@ -65,7 +74,7 @@ class Run:
     noise_std: np.ndarray | None
     release: float | None
     placement: Placement | None
-    unsteady: float = 0.0
+    ignore_after_release: float = 0.0
 
     @property
     def axes(self) -> np.ndarray:
@@ -87,6 +96,30 @@ class Run:
         if self.rest is not None and min(self.rest.stop, last) > max(self.rest.start, first):
             rest = slice(max(self.rest.start, first) - first, min(self.rest.stop, last) - first)
         return replace(self, times=self.times[first:last], positions=self.positions[first:last], rest=rest)
+
+    def released(self, markers: Sequence[int], skip: float, duration: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """The motion of ``markers`` from ``skip`` to ``duration`` [s] after the release, in frames that show them all.
+
+        Times (K,) [s since the release], positions (K, M, 3) [m, world] and the greatest speed [m/s]. Raises InputError
+        if the release is not known or too few frames are left.
+        """
+        if not skip < duration:
+            raise InputError(
+                f"run {self.name}: ignore_after_release: {skip:g} s leaves nothing of tracks.duration {duration:g} s"
+            )
+        if self.release is None:
+            raise InputError(f"run {self.name}: nobody knows when it was let go: give rest_frames")
+        cut, chosen = self.between(self.release + skip, self.release + duration), list(markers)
+        whole = np.asarray(np.isfinite(cut.positions[:, chosen]).all(axis=(1, 2)), bool)
+        if whole.mean() < MIN_SEEN_SHARE or whole.sum() < MIN_SEEN_FRAMES:
+            names = ", ".join(self.markers[m] for m in chosen)
+            raise InputError(
+                f"run {self.name}: all of {names} are seen in {int(whole.sum())} of {len(whole)} frames: leave out "
+                "with markers those that are rarely seen"
+            )
+        positions, times = cut.positions[whole][:, chosen], cut.elapsed[whole]
+        speed = float(np.linalg.norm(np.diff(positions, axis=0), axis=2).max() / np.diff(times).min())
+        return times, positions, speed
 
     def moving(self) -> Run:
         """The frames from the release on; all of them where it is not known."""
@@ -135,7 +168,7 @@ class Tracks:
         return {name: tuple(b for b in self.bodies.values() if b.group == name) for name in names}
 
 
-def rest_of(positions: np.ndarray, rest: slice | None) -> tuple[np.ndarray, np.ndarray | None]:
+def rest_positions(positions: np.ndarray, rest: slice | None) -> tuple[np.ndarray, np.ndarray | None]:
     """``at_rest`` and ``noise_std`` of a ``Run`` with positions (T, M, 3) [m]."""
     if rest is None:
         first = np.argmax(np.isfinite(positions), axis=0)

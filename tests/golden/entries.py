@@ -33,9 +33,9 @@ SAMPLE = {
     "refine": {
         "processes": 1, "particles": 200, "search_particles": 100, "families": 1, "laws": ["neo_hookean"],
         "effects": ["linear_drag", "body_force", "gravity_scale"], "baseline_rollouts": 6, "shortlist": 2,
-        "max_effects": 1, "search_second_effect": False, "tracking_error": 0, "unexplained": 5, "least_gain": 0,
-        "decisive_gain": 0, "simple_gain": 0, "decisive": 1, "plain_sigmas": 0, "least_bic": 0, "clear_bic": 0,
-        "least_sigmas": 0,
+        "max_effects": 1, "search_second_effect": False, "tracking_error": 0, "max_reduced_chi": 5, "min_gain": 0,
+        "decisive_gain": 0, "single_parameter_gain": 0, "decisive_variance_ratio": 1, "min_gls_z": 0, "min_bic_gain": 0,
+        "clear_bic_gain": 0, "min_strength_z": 0,
     },
 }  # fmt: skip
 BAR = {
@@ -108,20 +108,20 @@ def track_case(name: str, settings: dict[str, Any], folder: Path) -> Numbers:
     from masiv.mpm.config import SimulatorConfig
     from masiv.observations.motion import SampledMotion
     from masiv.refine.config import RefineConfig
-    from masiv.refine.stage import Throw, refine
-    from masiv.refine.summary import summary
+    from masiv.refine.document import document
+    from masiv.refine.from_video import Recording, refine_recordings
 
     runtime.start("cpu")
     case = replace(next(c for c in cases() if c.name == name), particles=CASE_PARTICLES)
     config = RefineConfig.model_validate({**CASE, "laws": [case.law], **settings})
     scene, motion = observed(case)
     fitted = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
-    run = Throw("0", scene, fitted, motion, case.fit_frames)
-    found = refine([run], IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config)
-    after = found.result.after
+    run = Recording("0", scene, fitted, motion, case.fit_frames)
+    result = refine_recordings([run], IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config)
+    after = result.after
     return {
         "observed": digest_of(motion.positions),
-        **refined(summary(found, config, dry_run=False)),
+        **refined(document(result)),
         "values": by_parameter(after.values),
         "stderr": by_parameter(after.stderr),
     }
@@ -134,7 +134,7 @@ ENTRIES = {
     "case_control_elastic": partial(
         track_case, "control_elastic",
         {
-            "families": 2, "laws": ["neo_hookean", "von_mises", "newtonian"], "above_noise": 0,
+            "families": 2, "laws": ["neo_hookean", "von_mises", "newtonian"], "noise_threshold": 0,
             "effects": ["linear_drag", "body_force"],
         },
     ),
@@ -192,13 +192,14 @@ def motions(run: Path) -> Numbers:
 
 def twin_of_video(run: Path) -> Numbers:
     twin = loaded(run / "twin.yaml")
+    (body,), start = twin["bodies"], twin["initial_conditions"][0]
     return {
-        "law": {"kind": twin["law"]["kind"], "values": parameters(twin["law"]["parameters"])},
-        "velocity": twin["initial"]["velocity"]["value"],
-        "omega": twin["initial"]["omega"]["value"],
+        "law": {"kind": body["law"]["kind"], "values": parameters(body["law"]["parameters"])},
+        "velocity": start["velocity"]["value"],
+        "omega": start["omega"]["value"],
         "ground": twin["boundary"]["ground"]["height"]["value"],
         "contact": twin["boundary"]["contact"],
-        "volume": twin["body"]["volume"]["value"],
+        "volume": body["volume"]["value"],
         "effects": {e["effect"]: list(parameters(e["parameters"]).values()) for e in twin["effects"]},
     }
 
@@ -277,10 +278,15 @@ def evaluation(run: Path) -> Numbers:
 def twin_of_tracks(run: Path) -> Numbers:
     twin = loaded(run / "twin.yaml")
     starts: dict[str, list[float]] = {}
-    for name, value in twin["starts"].items():
-        starts.setdefault(name.split("@")[1], []).append(value)
+    for start in twin["initial_conditions"]:
+        if start["release"] is None:  # a ball: its height alone is measured
+            place, velocity = start["placement"]["translation"], start["velocity"]
+            starts[start["observation"]] = [place["value"][1], velocity["value"][1]]
+        elif start["release"]["offsets"]:
+            starts[start["observation"]] = [offset["value"] for offset in start["release"]["offsets"].values()]
+    law = twin["bodies"][0]["law"] or {"kind": "rigid", "parameters": {}}
     return {
-        "law": {"kind": twin["law"]["kind"], "values": parameters(twin["law"]["parameters"])},
+        "law": {"kind": law["kind"], "values": parameters(law["parameters"])},
         "starts": starts,
         "effects": [
             {
@@ -303,15 +309,16 @@ def refined(found: dict[str, Any]) -> Numbers:
     """refine.json. Of a refit that was not accepted the errors are enough: its parameters may be next to arbitrary."""
     errors = {"rmse_mm": "trajectory_rmse_mm", "chamfer": "chamfer_1e3mm2", "psnr": "psnr_db",
               "psnr_in_scene": "psnr_box_in_scene_db", "ssim": "ssim", "iou": "mask_iou"}  # fmt: skip
-    left, proposed, gap = found["unexplained"], found["next_experiment"], found["stop_gap"]
+    left, proposed, force = found["unexplained"], found["next_experiment"], found["discrepancy_force"]
+    of_tracks = found["condition"] is not None or bool(found["bodies"])
     return {
         "verdict": found["verdict"],
         "laws": [found["laws"]["before"], found["laws"]["after"]],
-        "law": parameters(found.get("law_parameters", {})),
+        "law": parameters(found["law_parameters"]) if of_tracks else {},
         "noise_mm": found["noise_floor_mm"],
-        "grid_mm": [found["grid_floor_mm"]["fit"], found["grid_floor_mm"]["held_out"]],
+        "grid_mm": [found["discretization_mm"]["fit"], found["discretization_mm"]["held_out"]],
         "residual_mm": [found["residual_mm"]["fit"], found["residual_mm"]["held_out"]],
-        "residual_over_sigma": [found["residual_over_floor"]["before"], found["residual_over_floor"]["after"]],
+        "residual_over_sigma": [found["reduced_chi"]["before"], found["reduced_chi"]["after"]],
         "ranking": [
             {
                 "effect": c["effect"],
@@ -347,11 +354,11 @@ def refined(found: dict[str, Any]) -> Numbers:
                 "values": list(a["theta"].values()),
                 "stderr": list(a["stderr"].values()),
                 "alike": a["confusable_with"],
-                "instead": a["or_else"],
+                "instead": a["indistinguishable_from"],
             }
             for a in found["accepted"]
         ],
-        "smooth_force_mm": gap and [gap["fit_rmse_mm"], gap["held_out_rmse_mm"]],
+        "smooth_force_mm": force and [force["fit_rmse_mm"], force["held_out_rmse_mm"]],
         **{
             when: {
                 span: {own: found[when][span][key] for own, key in errors.items() if key in found[when][span]}
@@ -359,21 +366,25 @@ def refined(found: dict[str, Any]) -> Numbers:
             }
             for when in ("before", "after")
         },
-        "left_mm": [left["rmse_mm"], left["worst_mm"] if "worst_mm" in left else left["worst_frame_rmse_mm"]],
+        "left_mm": [left["rmse_mm"], left["worst_distance_mm" if of_tracks else "worst_instant_rmse_mm"]],
         "next": proposed
         and {
-            "between": proposed["tells_apart"],
-            "velocity": proposed["velocity"]["value"],
-            "omega": proposed["omega"]["value"],
-            "difference_mm": [proposed["predicted_difference_mm"], proposed["difference_in_this_throw_mm"]],
+            "between": proposed["distinguishes"],
+            "velocity": proposed["initial_velocity"]["value"],
+            "omega": proposed["initial_omega"]["value"],
+            "difference_mm": [proposed["predicted_difference_mm"], proposed["present_difference_mm"]],
         },
-        "runs": {r["run"]: [r["before_mm"], r["after_mm"]] for r in found.get("runs", [])},
+        "runs": {
+            r["observation"]: [next(iter(r[when].values())) for when in ("before_mm", "after_mm")]
+            for r in found["observations"]
+            if of_tracks
+        },
         "bodies": {
             name: [b["verdict"], b["effects"], b["held_out_mm"]["before"], b["held_out_mm"]["after"]]
             for name, b in found.get("bodies", {}).items()
         },
         "shared": [
-            [s["effect"], s["bodies"], s["value"], s["stderr"], s["spread_between_bodies"], s["held_out_rmse_mm"]]
+            [s["effect"], s["bodies"], s["value"], s["stderr"], s["std_between_bodies"], s["held_out_rmse_mm"]]
             for s in found.get("shared", [])
         ],
     }

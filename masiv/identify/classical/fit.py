@@ -19,8 +19,9 @@ from masiv.errors import NonFiniteError
 from masiv.identify.classical.residuals import JointResidual
 from masiv.identify.classical.search import search_family
 from masiv.identify.losses.objective import Objective
-from masiv.inference.correlation import effective_samples
-from masiv.inference.least_squares import FIRST_STEP, Estimate, covariance, fit_parameters, robust_cost, robust_weight
+from masiv.inference.least_squares import Estimate, clipped_step, covariance, gauss_newton
+from masiv.inference.noise_model import effective_samples
+from masiv.inference.robust import NORMAL_MAD, soft_l1_sum, soft_l1_weight
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.families import FAMILIES, Family, law_of, mean_distance
 from masiv.models.initial_state import InitialState, initial_state_parameters
@@ -31,8 +32,6 @@ from masiv.progress import Progress
 MIN_COST_DECREASE = 1e-3
 """A fit continues while a step lowers the cost by this fraction."""
 CHORD_STEPS = 4
-MAD_TO_STD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 SEARCHED, HALF_HORIZON, ALL_FRAMES, FURTHER, ALL_PARTICLES = range(5)
 """How far a fit is, ``FamilyFit.stage``: the coarse search; few particles over half of the frames, over all, over all
 once more; all particles."""
@@ -146,7 +145,7 @@ def _gauss_newton(
 
     parameters = _parameters(objective.problem, family, fit)
     # Residuals of pixels are bounded, and most are 0: they need no robust scale, and their median is none.
-    estimate = fit_parameters(
+    estimate = gauss_newton(
         residual, parameters, max_evaluations=budget, robust=not with_images, tolerance=MIN_COST_DECREASE
     )
     fit = _updated(objective.problem, fit, _path_estimate(estimate, joint), stage)
@@ -182,18 +181,18 @@ def fit_all_particles(
     parameters = _parameters(coarse.problem, family, fit)
     progress(label, 0, total)
     on_few = JointResidual(coarse, family, fit.contact, coarse.problem.frames, with_images=with_images)
-    linear = fit_parameters(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not with_images)
+    linear = gauss_newton(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not with_images)
     progress(label, 1, total)
     joint = JointResidual(
         objective, family, fit.contact, objective.problem.frames,
         with_images=with_images, chosen=coarse.problem.chosen,
     )  # fmt: skip
-    robust_scale = math.inf if with_images else max(MAD_TO_STD * float(np.median(np.abs(linear.residual))), 1e-12)
+    robust_scale = math.inf if with_images else max(NORMAL_MAD * float(np.median(np.abs(linear.residual))), 1e-12)
     values, paths, residual = _chord_steps(
         joint, parameters, fit.values, linear.jacobian, robust_scale,
         lambda step, error_m: progress(label, 2 + step, total, f"{1e3 * error_m:.1f} mm"),
     )  # fmt: skip
-    weight = robust_weight(residual, robust_scale)
+    weight = soft_l1_weight(residual, robust_scale)
     spread = covariance(linear.jacobian * weight[:, None], residual * weight)
     evaluations = linear.evaluations + CHORD_STEPS + 1
     estimate = Estimate(values, spread, linear.jacobian, residual, evaluations, tuple(parameters))
@@ -221,14 +220,14 @@ def _chord_steps(
     paths, residual = joint(values)
     report(0, mean_distance(paths))
     for step in range(CHORD_STEPS):
-        weight = robust_weight(residual, robust_scale)
+        weight = soft_l1_weight(residual, robust_scale)
         full = np.linalg.lstsq(jacobian * weight[:, None], -residual * weight, rcond=None)[0]
-        trial = _clipped_step(parameters, values, scale * full)
+        trial = clipped_step(parameters, values, scale * full)
         try:
             trial_paths, trial_residual = joint(trial)
         except NonFiniteError:
             trial_paths, trial_residual = paths, np.full_like(residual, np.inf)
-        before, cost = (robust_cost(r, robust_scale) for r in (residual, trial_residual))
+        before, cost = (soft_l1_sum(r, robust_scale) for r in (residual, trial_residual))
         if cost < before:
             values, paths, residual = trial, trial_paths, trial_residual
             if cost > (1 - MIN_COST_DECREASE) * before:
@@ -237,15 +236,6 @@ def _chord_steps(
             scale *= 0.5
         report(1 + step, mean_distance(paths))
     return values, paths, residual
-
-
-def _clipped_step(parameters: list[Parameter], values: dict[str, float], step: np.ndarray) -> dict[str, float]:
-    """``values`` after a ``step`` (P,) in the fitted scales, clipped to the range of a linear model and the bounds."""
-    out = {}
-    for p, delta in zip(parameters, step, strict=True):
-        limit = FIRST_STEP * p.step
-        out[p.name] = p.value(p.fitted(values[p.name]) + float(np.clip(delta, -limit, limit)))
-    return out
 
 
 def _parameters(problem: Problem, family: Family, fit: FamilyFit) -> list[Parameter]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from masiv.errors import MasivError, NonFiniteError
-from masiv.inference.least_squares import fit_parameters
+from masiv.inference.least_squares import broyden, derivative, gauss_newton, gauss_newton_jump, linearize
+from masiv.inference.robust import soft_l1_mean_square, soft_l1_sum
 from masiv.models.parameters import Parameter
 
 TIMES = np.linspace(0, 2, 200)
@@ -19,7 +21,7 @@ def test_linear_regression_and_its_covariance():
     truth = np.array([0.3, -2.0, 0.7])
     noise = np.random.default_rng(0).normal(0, 0.1, len(TIMES))
     parameters = [Parameter(name, 0.0, -10, 10, 0.01) for name in "abc"]
-    found = fit_parameters(
+    found = gauss_newton(
         lambda v: design @ [v["a"], v["b"], v["c"]] - design @ truth - noise, parameters, max_evaluations=200
     )
     exact, squares, *_ = np.linalg.lstsq(design, design @ truth + noise, rcond=None)
@@ -34,8 +36,8 @@ def test_linear_regression_and_its_covariance():
 def test_repeated_residuals_tell_no_more():
     noise = np.random.default_rng(1).normal(0, 0.1, 50)
     parameter = [Parameter("mean", 0.0, -5, 5, 0.01)]
-    once = fit_parameters(lambda v: v["mean"] - noise, parameter, max_evaluations=50)
-    often = fit_parameters(lambda v: np.repeat(v["mean"] - noise, 20), parameter, max_evaluations=50)
+    once = gauss_newton(lambda v: v["mean"] - noise, parameter, max_evaluations=50)
+    often = gauss_newton(lambda v: np.repeat(v["mean"] - noise, 20), parameter, max_evaluations=50)
     assert math.isclose(often.stderr(50)["mean"], once.stderr(50)["mean"], rel_tol=1e-6)
     assert often.stderr(1000)["mean"] < 0.3 * once.stderr(50)["mean"]
     assert often.stderr(1)["mean"] == math.inf
@@ -45,7 +47,7 @@ def test_logarithmic_parameter_over_orders_of_magnitude():
     def residual(v):
         return 2 * np.exp(-v["rate"] * TIMES) + 0.1 - (2 * np.exp(-3.0 * TIMES) + 0.1)
 
-    found = fit_parameters(residual, [Parameter("rate", 0.05, 1e-3, 1e3, 0.02, log=True)], max_evaluations=60)
+    found = gauss_newton(residual, [Parameter("rate", 0.05, 1e-3, 1e3, 0.02, log=True)], max_evaluations=60)
     assert math.isclose(found.values["rate"], 3.0, rel_tol=1e-4)
 
 
@@ -53,7 +55,7 @@ def test_logarithmic_standard_error_is_in_the_unit_of_the_value():
     noise = np.random.default_rng(2).normal(0, 0.05, len(TIMES))
     for log in (True, False):
         parameter = [Parameter("slope", 1.0, 0.1, 100, 1e-3, log=log)]
-        found = fit_parameters(lambda v: v["slope"] * TIMES - 5 * TIMES - noise, parameter, max_evaluations=60)
+        found = gauss_newton(lambda v: v["slope"] * TIMES - 5 * TIMES - noise, parameter, max_evaluations=60)
         assert math.isclose(found.stderr(200)["slope"], 0.05 / np.linalg.norm(TIMES), rel_tol=0.15)
 
 
@@ -64,7 +66,7 @@ def test_bounds_hold_and_the_other_parameter_makes_up():
         seen.append(v["a"])
         return np.array([v["a"] - 3.0, v["a"] + v["b"] - 5.0])
 
-    found = fit_parameters(
+    found = gauss_newton(
         residual, [Parameter("a", 0.0, -1, 1, 0.05), Parameter("b", 0.0, -10, 10, 0.05)], max_evaluations=300
     )
     assert max(seen) <= 1
@@ -81,7 +83,7 @@ def test_a_step_that_diverges_is_refused():
             raise NonFiniteError(3, 4, "too fast")
         return np.array([10 * (v["x"] ** 2 - 1.9**2), 0.01])
 
-    found = fit_parameters(residual, [Parameter("x", 0.05, 1e-6, 50, 0.02)], max_evaluations=100)
+    found = gauss_newton(residual, [Parameter("x", 0.05, 1e-6, 50, 0.02)], max_evaluations=100)
     assert refused
     assert math.isclose(found.values["x"], 1.9, rel_tol=1e-3)
 
@@ -91,9 +93,9 @@ def test_a_start_that_diverges_is_an_error():
         raise NonFiniteError(0, 0, "too fast")
 
     with pytest.raises(NonFiniteError):
-        fit_parameters(residual, [Parameter("x", 1.0, 0, 2, 0.1)], max_evaluations=10)
+        gauss_newton(residual, [Parameter("x", 1.0, 0, 2, 0.1)], max_evaluations=10)
     with pytest.raises(NonFiniteError):
-        fit_parameters(lambda v: np.array([np.nan]), [Parameter("x", 1.0, 0, 2, 0.1)], max_evaluations=10)
+        gauss_newton(lambda v: np.array([np.nan]), [Parameter("x", 1.0, 0, 2, 0.1)], max_evaluations=10)
 
 
 def test_divergence_on_both_sides_is_an_error_that_names_the_parameter():
@@ -103,7 +105,7 @@ def test_divergence_on_both_sides_is_an_error_that_names_the_parameter():
         return np.ones(2)
 
     with pytest.raises(MasivError, match="both sides of x"):
-        fit_parameters(residual, [Parameter("x", 1.0, 0, 2, 0.1)], max_evaluations=10)
+        gauss_newton(residual, [Parameter("x", 1.0, 0, 2, 0.1)], max_evaluations=10)
 
 
 def test_evaluations_are_counted_and_kept_to():
@@ -116,22 +118,22 @@ def test_evaluations_are_counted_and_kept_to():
     parameters = [Parameter("x", -1.2, -5, 5, 1e-3), Parameter("y", 1.0, -5, 5, 1e-3)]
     for budget in (3, 10, 25):
         calls.clear()
-        found = fit_parameters(residual, parameters, max_evaluations=budget)
+        found = gauss_newton(residual, parameters, max_evaluations=budget)
         assert found.evaluations == len(calls) <= budget
         assert float(found.residual @ found.residual) <= 24.2
     calls.clear()
-    found = fit_parameters(residual, parameters, max_evaluations=4000)
+    found = gauss_newton(residual, parameters, max_evaluations=4000)
     assert math.isclose(found.values["x"], 1, abs_tol=1e-2)
     assert math.isclose(found.values["y"], 1, abs_tol=2e-2)
 
 
 def test_a_parameter_that_nothing_depends_on_has_infinite_error():
     parameters = [Parameter("a", 0.0, -5, 5, 0.1), Parameter("b", 0.0, -5, 5, 0.1)]
-    found = fit_parameters(lambda v: v["a"] - np.array([1.0, 1.2, 0.9, 1.0]), parameters, max_evaluations=50)
+    found = gauss_newton(lambda v: v["a"] - np.array([1.0, 1.2, 0.9, 1.0]), parameters, max_evaluations=50)
     errors = found.stderr(4)
     assert errors["b"] == math.inf
     assert 0 < errors["a"] < 0.2
-    both = fit_parameters(lambda v: v["a"] + v["b"] - np.array([1.0, 1.2, 0.9]), parameters, max_evaluations=50)
+    both = gauss_newton(lambda v: v["a"] + v["b"] - np.array([1.0, 1.2, 0.9]), parameters, max_evaluations=50)
     assert min(both.stderr(3).values()) > 1e3
 
 
@@ -139,10 +141,8 @@ def test_robust_fit_ignores_wild_residuals():
     noise = np.random.default_rng(3).normal(0, 0.05, len(TIMES))
     noise[::20] += 5.0
     parameter = [Parameter("slope", 1.0, 0.0, 10, 0.01)]
-    plain = fit_parameters(lambda v: v["slope"] * TIMES - 2 * TIMES - noise, parameter, max_evaluations=100)
-    robust = fit_parameters(
-        lambda v: v["slope"] * TIMES - 2 * TIMES - noise, parameter, max_evaluations=100, robust=True
-    )
+    plain = gauss_newton(lambda v: v["slope"] * TIMES - 2 * TIMES - noise, parameter, max_evaluations=100)
+    robust = gauss_newton(lambda v: v["slope"] * TIMES - 2 * TIMES - noise, parameter, max_evaluations=100, robust=True)
     assert abs(robust.values["slope"] - 2) < 0.5 * abs(plain.values["slope"] - 2)
     assert robust.stderr(200)["slope"] < plain.stderr(200)["slope"]
 
@@ -152,10 +152,86 @@ def test_the_same_call_gives_the_same_bits():
     parameters = [Parameter("a", 1.0, 0.1, 10, 0.01, log=True), Parameter("b", 0.0, -1, 1, 0.01)]
 
     def run():
-        return fit_parameters(
+        return gauss_newton(
             lambda v: v["a"] * np.sin(TIMES) + v["b"] - 2 * np.sin(TIMES) - noise, parameters, max_evaluations=60
         )
 
     first, second = run(), run()
     assert first.values == second.values
     assert np.array_equal(first.covariance, second.covariance)
+
+
+# -- with a Jacobian that is known -----------------------------------------------------------------------------------
+
+
+def linear_problem(matrix, truth):
+    """Residual of a linear model, and its parameters a and b, b at most 2."""
+    target = matrix @ np.array(truth)
+    bounds = [Parameter("a", 0.0, -100.0, 100.0, 1e-3), Parameter("b", 0.0, -100.0, 2.0, 1e-3)]
+    return (lambda v: matrix @ np.array([v["a"], v["b"]]) - target), bounds
+
+
+@pytest.mark.parametrize(("truth", "reached"), [([40.0, -7.0], [40.0, -7.0]), ([3.0, 50.0], None)])
+def test_a_jump_ends_in_the_minimum_however_far_and_within_bounds(truth, reached):
+    matrix = np.random.default_rng(0).normal(size=(30, 2))
+    residual, parameters = linear_problem(matrix, truth)
+    start = linearize(residual, parameters, {"a": 0.0, "b": 0.0})
+    np.testing.assert_allclose(start.jacobian, matrix, atol=1e-9)
+    here = gauss_newton_jump(residual, parameters, start, robust_scale=1e6)
+    np.testing.assert_allclose(here.residual, residual(here.values))
+    if reached is None:
+        assert here.values["b"] == 2.0
+    else:
+        assert [here.values["a"], here.values["b"]] == pytest.approx(reached, rel=1e-2)
+        np.testing.assert_allclose(here.jacobian, matrix, atol=1e-9)  # it was exact, and stays so
+
+
+def test_broyden_reaches_a_minimum_with_a_jacobian_that_was_wrong():
+    matrix = np.random.default_rng(2).normal(size=(30, 2))
+    residual, parameters = linear_problem(matrix, [0.02, -0.015])
+    start = linearize(residual, parameters, {"a": 0.0, "b": 0.0})
+    wrong = replace(start, jacobian=start.jacobian @ np.array([[1.0, 0.6], [0.2, 1.4]]))
+    calls = []
+
+    def counted(values):
+        calls.append(values)
+        return residual(values)
+
+    here = broyden(counted, parameters, wrong, steps=12, robust_scale=1e6)
+    assert len(calls) <= 12
+    assert np.linalg.norm(here.residual) < 1e-2 * np.linalg.norm(start.residual)
+    np.testing.assert_allclose(here.residual, residual(here.values))
+
+
+def test_broyden_goes_round_what_diverges():
+    matrix = np.random.default_rng(3).normal(size=(30, 2))
+    residual, parameters = linear_problem(matrix, [0.006, 0.0])
+
+    def bounded(values):
+        if values["a"] > 0.007:
+            raise NonFiniteError(0, 0, "too fast")
+        return residual(values)
+
+    start = linearize(residual, parameters, {"a": 0.0, "b": 0.0})
+    too_flat = replace(start, jacobian=0.5 * start.jacobian)  # its first step goes twice as far as it should
+    here = broyden(bounded, parameters, too_flat, steps=12, robust_scale=1e6)
+    assert here.values["a"] == pytest.approx(0.006, rel=0.05)
+
+
+def test_a_derivative_that_diverges_on_both_sides_is_an_error():
+    def residual(values):
+        if values["x"] != 1.0:
+            raise NonFiniteError(0, 0, "too fast")
+        return np.ones(2)
+
+    with pytest.raises(NonFiniteError, match="both sides of x"):
+        derivative(residual, {"x": 1.0}, np.ones(2), Parameter("x", 1.0, 0, 2, 0.1))
+
+
+def test_the_two_robust_costs_differ_in_scale_alone():
+    residual = np.random.default_rng(5).normal(0, 2e-3, 50)
+    for scale in (1e-3, 1e-2):
+        per_sample = soft_l1_sum(residual, scale) / len(residual)
+        assert soft_l1_mean_square(residual, scale) == pytest.approx(2 * scale**2 * per_sample)
+    assert soft_l1_mean_square(residual, 1e3) == pytest.approx(float((residual**2).mean()), rel=1e-6)
+    assert soft_l1_sum(residual, math.inf) == pytest.approx(float(residual @ residual))

@@ -9,7 +9,8 @@ import pytest
 
 from masiv.errors import InputError
 from masiv.report import plots
-from masiv.report.refined import refine_section
+from masiv.report.page import Page
+from masiv.report.sections.refinement import read_refined, refinement_section
 
 ERRORS = {
     "fit": {"frames": [0, 11], "trajectory_rmse_mm": 10.7, "chamfer_1e3mm2": 0.31},
@@ -25,8 +26,8 @@ def document(**changes):
     }  # fmt: skip
     refused = refit | {"effect": "swirl", "accepted": False, "objections": ["held out <gets> worse"], "parameters": {}}
     whole = {
-        "schema": 1, "noise_floor_mm": 2.5, "grid_floor_mm": {"fit": 3.0, "held_out": 4.0},
-        "grid_share": {"before": 0.4, "after": 0.625},
+        "schema": 2, "noise_floor_mm": 2.5, "discretization_mm": {"fit": 3.0, "held_out": 4.0},
+        "grid_change": {"before": 0.4, "after": 0.625},
         "residual_mm": {"fit": 10.7, "held_out": 40.2},
         "candidates": [
             {"effect": "linear_drag", "explained": 0.81, "theta": 0.7, "unit": "1/s", "stderr": 0.02,
@@ -37,15 +38,17 @@ def document(**changes):
         "before": ERRORS,
         "after": {"fit": ERRORS["fit"] | {"trajectory_rmse_mm": 4.2},
                   "held_out": ERRORS["held_out"] | {"trajectory_rmse_mm": 13.1}},
-        "unexplained": {"rmse_mm": 5.0, "noise_floor_mm": 2.5, "worst_frame": 14.5, "worst_frame_rmse_mm": 14.0,
-                        "rmse_mm_by_instant": [1.0], "worst_place_at_frame_0_m": [0.1, 0.2, 0.3],
+        "unexplained": {"rmse_mm": 5.0, "noise_floor_mm": 2.5, "worst_time_s": 0.6, "worst_instant_rmse_mm": 14.0,
+                        "rmse_mm_by_instant": {"run": [1.0]}, "worst_place_at_start_m": [0.1, 0.2, 0.3],
                         "worst_place_rmse_mm": 9.0},
         "verdict": "effect added", "laws": {"before": "neo_hookean", "after": "neo_hookean"},
+        "discrepancy_force": None,
         "rounds": [{"base": {"law": "neo_hookean", "effects": []}, "refits": [refit, refused]}],
         "next_experiment": {
-            "tells_apart": ["linear_drag", "quadratic_drag"], "velocity": {"value": [1.5, 0.0, 0.0], "unit": "m/s"},
-            "omega": {"value": [0.0, 4.0, 0.0], "unit": "rad/s"}, "predicted_difference_mm": 61.0,
-            "difference_in_this_throw_mm": 3.0,
+            "distinguishes": ["linear_drag", "quadratic_drag"],
+            "initial_velocity": {"value": [1.5, 0.0, 0.0], "unit": "m/s"},
+            "initial_omega": {"value": [0.0, 4.0, 0.0], "unit": "rad/s"}, "predicted_difference_mm": 61.0,
+            "present_difference_mm": 3.0,
         },
         "rollouts": 88,
     }  # fmt: skip
@@ -58,8 +61,8 @@ def fields(instants=16, fitted=12, particles=90):
     growth = np.linspace(0.001, 0.04, instants)[:, None, None]
     before = (growth * np.array([1.0, 0.2, 0.0]) + 1e-4 * generator.normal(size=(instants, particles, 3))).astype("f4")
     return {
-        "before": before, "after": 0.3 * before, "positions": positions,
-        "times": np.arange(1, instants + 1) / 24, "fitted": np.array(fitted),
+        "observations": np.array(["run"]), "before@run": before, "after@run": 0.3 * before, "points@run": positions,
+        "times@run": np.arange(1, instants + 1) / 24, "fit_count@run": np.array(fitted),
     }  # fmt: skip
 
 
@@ -68,9 +71,17 @@ def write(run, found, arrays):
     np.savez(run / "refine.npz", **arrays)
 
 
+def section_of(run, up=None):
+    page, refined = Page(""), read_refined(run)
+    if refined is None:
+        return None
+    refinement_section(page, *refined, up)
+    return "".join(page.parts)
+
+
 def test_numbers_and_pictures_of_an_accepted_effect(tmp_path):
     write(tmp_path, document(), fields())
-    section = refine_section(tmp_path, np.array([0.0, 1.0, 0.0]))
+    section = section_of(tmp_path, np.array([0.0, 1.0, 0.0]))
     assert section.count("data:image/png;base64,") == 2
     shown = ["effect added: linear drag", "0.7234", "0.0213", "81 %", "10.7 → 4.2", "40.2 → 13.1", "quadratic drag"]
     markup = ["held out &lt;gets&gt; worse", "slows &amp; slows"]  # text is never markup
@@ -81,15 +92,15 @@ def test_numbers_and_pictures_of_an_accepted_effect(tmp_path):
 def test_nothing_found(tmp_path):
     alone = {"fit": ERRORS["fit"], "held_out": {}}
     found = document(accepted=[], candidates=[], rounds=[], next_experiment=None, before=alone, after=alone,
-                     verdict="nothing missing", grid_share=None)  # fmt: skip
+                     verdict="nothing missing", grid_change={"before": None, "after": None})  # fmt: skip
     write(tmp_path, found, fields(instants=12, fitted=12))
-    section = refine_section(tmp_path)
+    section = section_of(tmp_path)
     assert "nothing missing" in section
     assert [text for text in ("What was added", "held out", "Refits", "finer grids") if text in section] == []
 
 
-def test_a_stop_gap_is_called_one(tmp_path):
-    gap = {
+def test_a_discrepancy_force_is_no_cause(tmp_path):
+    force = {
         "effect": "smooth_force",
         "theta": {},
         "stderr": {},
@@ -97,22 +108,22 @@ def test_a_stop_gap_is_called_one(tmp_path):
         "fit_rmse_mm": 3.25,
         "held_out_rmse_mm": 9.75,
     }
-    write(tmp_path, document(accepted=[], verdict="unexplained residual", stop_gap=gap), fields())
-    section = refine_section(tmp_path)
+    write(tmp_path, document(accepted=[], verdict="unexplained residual", discrepancy_force=force), fields())
+    section = section_of(tmp_path)
     assert [
-        t for t in ("unexplained residual", "not an explanation", "3.25", "9.75 mm held out") if t not in section
+        t for t in ("unexplained residual", "without a known cause", "3.25", "9.75 mm held out") if t not in section
     ] == []
 
 
 def test_absent_and_unreadable(tmp_path):
-    assert refine_section(tmp_path) is None
+    assert section_of(tmp_path) is None
     write(tmp_path, document(), fields())
     (tmp_path / "refine.npz").write_bytes(b"PK broken")
     with pytest.raises(InputError, match="run masiv refine again"):
-        refine_section(tmp_path)
-    write(tmp_path, document(schema=2), fields())
+        section_of(tmp_path)
+    write(tmp_path, document(schema=1), fields())
     with pytest.raises(InputError, match="another version"):
-        refine_section(tmp_path)
+        section_of(tmp_path)
 
 
 def test_fields_of_one_instant_and_of_no_residual():

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from masiv.inference.noise_model import NoiseModel
 from masiv.inference.significance import vuong_z, wald_z_gls
-from masiv.inference.smooth_noise import smoothness
+from masiv.inference.smooth_noise import estimate_smooth_noise
 from masiv.models.parameters import Parameter
 
 INSTANTS, POINTS = 11, 120
@@ -17,7 +18,9 @@ PLACES = np.random.default_rng(1).uniform(-0.3, 0.3, size=(POINTS, 3))
 TIMES = np.arange(1.0, INSTANTS + 1)
 
 
-WATCHED = [SimpleNamespace(points=PLACES, fit_count=INSTANTS, noise_std=SIZE, residual_std=np.full(INSTANTS, SIZE))]
+OBSERVED = NoiseModel(
+    [SimpleNamespace(points=PLACES, fit_count=INSTANTS, noise_std=SIZE, residual_std=np.full(INSTANTS, SIZE))]
+)
 
 
 def noises(count, seed=0):
@@ -70,18 +73,18 @@ def test_lengths_are_those_of_the_noise_though_a_fit_took_its_smoothest_part():
     for noise in noises(8):
         left = noise.ravel() - jacobian @ np.linalg.lstsq(jacobian, noise.ravel(), rcond=None)[0]
         assert (left**2).mean() < 0.9 * (noise**2).mean()
-        lengths.append(smoothness(left.reshape(noise.shape), jacobian.reshape(*noise.shape, -1), PLACES))
-    assert np.median([n.time_count for n in lengths]) == pytest.approx(LENGTH, rel=0.3)
-    assert np.median([n.metres for n in lengths]) == pytest.approx(METRES, rel=0.35)
+        lengths.append(estimate_smooth_noise(left.reshape(noise.shape), jacobian.reshape(*noise.shape, -1), PLACES))
+    assert np.median([n.correlation_time for n in lengths]) == pytest.approx(LENGTH, rel=0.3)
+    assert np.median([n.correlation_length for n in lengths]) == pytest.approx(METRES, rel=0.35)
     assert np.median([n.variance for n in lengths]) == pytest.approx(SIZE**2, rel=0.35)
     coarse = PLACES[:4]
-    assert smoothness(np.ones((9, 4, 3)), np.zeros((9, 4, 3, 0)), coarse) is None
-    assert smoothness(np.ones((2, POINTS, 3)), np.zeros((2, POINTS, 3, 0)), PLACES) is None
+    assert estimate_smooth_noise(np.ones((9, 4, 3)), np.zeros((9, 4, 3, 0)), coarse) is None
+    assert estimate_smooth_noise(np.ones((2, POINTS, 3)), np.zeros((2, POINTS, 3, 0)), PLACES) is None
 
 
 @pytest.mark.parametrize("pattern", [SMOOTH, pytest.param(ROUGH, marks=pytest.mark.slow)], ids=["smooth", "rough"])
 def test_noise_alone_is_as_certain_as_chance_has_it(pattern):
-    sigmas = [wald_z_gls(*found(noise, pattern, 0.0), WATCHED) for noise in noises(60, seed=2)]
+    sigmas = [wald_z_gls(*found(noise, pattern, 0.0), OBSERVED) for noise in noises(60, seed=2)]
     assert np.mean(np.square(sigmas)) == pytest.approx(1.0, rel=0.6)
 
 
@@ -102,25 +105,25 @@ BOTH = SMOOTH, (TIMES**2)[:, None, None] * np.array([3e-3, 0.0, 0.0]) * (1 + 3 *
 @pytest.mark.slow
 def test_of_two_causes_that_are_as_near_to_the_truth_chance_decides():
     fits = [rivals(noise, BOTH, (0.0, 0.0)) for noise in noises(40, seed=5)]
-    sigmas = [vuong_z(*fit, WATCHED) for fit in fits]
+    sigmas = [vuong_z(*fit, OBSERVED) for fit in fits]
     assert np.mean(np.square(sigmas)) < 1.6
     assert np.mean(np.abs(sigmas) > 2) <= 0.1
-    assert vuong_z(fits[0][0], fits[0][1], WATCHED) == pytest.approx(-vuong_z(*fits[0][::-1], WATCHED), rel=0.5)
+    assert vuong_z(fits[0][0], fits[0][1], OBSERVED) == pytest.approx(-vuong_z(*fits[0][::-1], OBSERVED), rel=0.5)
 
 
 def test_a_cause_that_is_there_is_told_from_one_that_is_not_the_better_the_more_they_differ():
     (noise,) = noises(1, seed=6)
     there, other = rivals(noise, BOTH, (1.0, 0.0))
-    assert vuong_z(there, other, WATCHED) > 4
+    assert vuong_z(there, other, OBSERVED) > 4
     nearly = SMOOTH * (1 + 0.003 * PLACES[:, :1])
     there, other = rivals(noise, (SMOOTH, nearly), (1.0, 0.0))
-    assert abs(vuong_z(there, other, WATCHED)) < 2
-    assert vuong_z(there, there, WATCHED) == 0.0
+    assert abs(vuong_z(there, other, OBSERVED)) < 2
+    assert vuong_z(there, there, OBSERVED) == 0.0
 
 
 def test_a_smooth_cause_is_less_certain_than_a_rough_one_of_the_same_size():
     (noise,) = noises(1, seed=3)
-    smooth, rough = (wald_z_gls(*found(noise, p, 0.01), WATCHED) for p in (SMOOTH, ROUGH))
+    smooth, rough = (wald_z_gls(*found(noise, p, 0.01), OBSERVED) for p in (SMOOTH, ROUGH))
     assert rough > 3 * smooth
-    assert wald_z_gls(*found(noise, SMOOTH, 0.3), WATCHED) > 6
-    assert wald_z_gls(*found(noise, 0 * SMOOTH, 0.3), WATCHED) == 0.0
+    assert wald_z_gls(*found(noise, SMOOTH, 0.3), OBSERVED) > 6
+    assert wald_z_gls(*found(noise, 0 * SMOOTH, 0.3), OBSERVED) == 0.0

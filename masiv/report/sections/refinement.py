@@ -27,40 +27,54 @@ METRICS = {
 
 
 def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-    """refine.json and refine.npz of the run folder, None where it lacks one. InputError: unreadable."""
+    """refine.json and refine.npz of the run folder, None if it lacks one. Raises InputError if they cannot be read."""
     if not (run / REFINED).is_file() or not (run / FIELDS).is_file():
         return None
     try:
         document = json.loads((run / REFINED).read_text(encoding="utf-8"))
         with np.load(run / FIELDS, allow_pickle=False) as file:
-            fields = {name: file[name] for name in ("before", "after", "positions", "times", "fitted")}
+            first = str(file["observations"][0])
+            fields = {name: file[f"{name}@{first}"] for name in ("before", "after", "points", "times", "fit_count")}
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise InputError(f"{run / REFINED} and {FIELDS} cannot be read ({error}): run masiv refine again") from error
-    if not isinstance(document, dict) or document.get("schema") != 1:
+    if not isinstance(document, dict) or document.get("schema") != 2:
         raise InputError(f"{run / REFINED} is of another version of masiv: run masiv refine again")
     return document, fields
 
 
-def refine_section(run: Path, up: np.ndarray | None = None) -> str | None:
-    """HTML of the section on what ``masiv refine`` left in ``run``, None where it was not run.
-
-    up (3,): upwards in the world, for the views. Raises InputError where the files cannot be read.
-    """
-    found = read_refined(run)
-    if found is None:
-        return None
-    document, fields = found
-    page = Page("")
-    page.heading("Closing the loop: what does the model lack?")
+def refinement_section(
+    page: Page,
+    document: Mapping[str, Any],
+    fields: Mapping[str, np.ndarray] | None = None,
+    up: np.ndarray | None = None,
+) -> None:
+    """What ``document`` (refine.json) says. fields: arrays of refine.npz, drawn in time and space if given. up (3,):
+    upwards in the world, for the views."""
+    title = "Closing the loop: what does the model lack?"
+    page.heading(f"{title} Condition {document['condition']}" if document.get("condition") else title)
     page.note(_verdict(document))
-    _figures(page, document, fields, up)
+    if fields is not None:
+        _figures(page, document, fields, up)
     _causes(page, document["candidates"])
     _refits(page, document["rounds"])
     _before_after(page, document["before"], document["after"])
     _accepted(page, document["accepted"])
-    _unexplained(page, document["unexplained"], document.get("stop_gap"))
-    _next_throw(page, document.get("next_experiment"))
-    return "".join(page.parts)
+    _bodies(page, document.get("bodies") or {})
+    _unexplained(page, document["unexplained"], document["discrepancy_force"])
+    _next_experiment(page, document.get("next_experiment"))
+
+
+def _bodies(page: Page, bodies: Mapping[str, Any]) -> None:
+    if not bodies:
+        return
+    page.subheading("By body, on held-out observations")
+    page.table(
+        ["body", "verdict", "effects", "before [mm]", "after [mm]"],
+        [
+            [name, b["verdict"], ", ".join(b["effects"]), b["held_out_mm"]["before"], b["held_out_mm"]["after"]]
+            for name, b in bodies.items()
+        ],
+    )
 
 
 def _verdict(document: Mapping[str, Any]) -> str:
@@ -70,7 +84,7 @@ def _verdict(document: Mapping[str, Any]) -> str:
         law += f", then {words(laws['after'])}"
     errors = [
         f"{label} {_mm(document['before'], split)} → {_mm(document['after'], split)} mm"
-        for split, label in (("fit", "fitted frames"), ("held_out", "held-out frames"))
+        for split, label in (("fit", "fitted"), ("held_out", "held out"))
         if document["before"].get(split)
     ]
     return (
@@ -81,8 +95,8 @@ def _verdict(document: Mapping[str, Any]) -> str:
 
 
 def _grid(document: Mapping[str, Any]) -> str:
-    """How much of what finer grids change is in the motion that the residual is of; nothing where none was fitted."""
-    share = (document.get("grid_share") or {}).get("after")
+    """How much of what finer grids change is in the motion that the residual is of; nothing if none was fitted."""
+    share = document["grid_change"]["after"]
     if share is None:
         return ""
     return f" Simulated with few particles; {number(share)} of what finer grids change on average is added."
@@ -98,15 +112,15 @@ def _figures(page: Page, document: Mapping[str, Any], fields: Mapping[str, np.nd
     shown = {name if added else "without effects": fields[name] for name in names}
     times = fields["times"]
     page.picture(
-        plots.residual_in_time(shown, times, int(fields["fitted"]), document["noise_floor_mm"]), "residual in time"
+        plots.residual_in_time(shown, times, int(fields["fit_count"]), document["noise_floor_mm"]), "residual in time"
     )
     page.note(
-        "What the added effect explains is the gap between the curves, also on held-out frames, which no fit saw; what "
-        "stays above the dashed line is not noise."
+        "The gap between the curves is what the added effect explains. No fit saw the held-out frames, which take part "
+        "in the choice of effects. What stays above the dashed line is not noise."
         if added
         else "A curve near the dashed line leaves nothing to explain; one that grows away from it is missing physics."
     )
-    page.picture(plots.residual_in_space(shown, fields["positions"], times, up), "residual in space")
+    page.picture(plots.residual_in_space(shown, fields["points"], times, up), "residual in space")
     page.note(
         "Particles at frame 0. An even colour is an error of the whole body, a bright spot one of a part; arrows point "
         "from the observed to the simulated position."
@@ -122,7 +136,7 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
         ["effect", "explains alone", "strength", "unit", "standard error", "looks like", "what it does in a video"],
         [
             [
-                words(c["effect"]),
+                _name(c),
                 Share(c["explained"]),
                 _number(c["theta"]),
                 _unit(c["unit"]),
@@ -134,9 +148,9 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
         ],
     )
     page.note(
-        "Share of the residual that one effect explains, once launch, stiffness and ground have absorbed what they "
-        "can (score test, first order: a shortlist, the refits decide). Looks like: what this motion hardly tells it "
-        "from."
+        "Share of the residual that one effect explains, after initial velocity, stiffness and ground have absorbed "
+        "what they can (score test, first order: a shortlist, the refits decide). Looks like: effects that this motion "
+        "hardly distinguishes from it."
     )
 
 
@@ -147,7 +161,7 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
             values = ", ".join(f"{words(n)} {number(_number(q['value']))}" for n, q in refit["parameters"].items())
             result = "accepted" if refit["accepted"] else "; ".join(refit["objections"]) or "another was better"
             rows.append([
-                turn, ", ".join(map(words, [*done["base"]["effects"], refit["effect"]])), words(refit["law"]),
+                turn, ", ".join(map(words, [*done["base"]["effects"], _name(refit)])), words(refit["law"]),
                 _number(refit["fit_rmse_mm"]), _number(refit["held_out_rmse_mm"]),
                 _number(refit["information_gain"]), values, result,
             ])  # fmt: skip
@@ -155,10 +169,19 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
         return
     page.subheading("Refits that competed")
     page.table(
-        ["round", "effects", "law", "fitted [mm]", "held out [mm]", "BIC falls by", "values", "accepted, or why not"],
+        [
+            "round",
+            "effects",
+            "law",
+            "fitted [mm]",
+            "held out [mm]",
+            "BIC falls by",
+            "values",
+            "accepted, or objections",
+        ],
         rows,
     )
-    page.note("Each was fitted through the rollout together with the law's parameters and the launch.")
+    page.note("Each was fitted through the rollout together with the law's parameters and the initial state.")
 
 
 def _before_after(page: Page, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
@@ -186,15 +209,15 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
         return
     page.subheading("What was added")
     page.table(
-        ["effect", "parameter", "value", "standard error", "unit", "may as well be", "looks like"],
+        ["effect", "parameter", "value", "standard error", "unit", "indistinguishable from", "looks like"],
         [
             [
-                words(a["effect"]),
+                _name(a),
                 words(n),
                 _number(value),
                 _number(a["stderr"].get(n)),
                 _unit(a["unit"].get(n, "")),
-                ", ".join(map(words, a.get("or_else", []))) or None,
+                ", ".join(map(words, a.get("indistinguishable_from", []))) or None,
                 ", ".join(map(words, a.get("confusable_with", []))),
             ]
             for a in accepted
@@ -204,40 +227,46 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
     page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
 
 
-def _unexplained(page: Page, left: Mapping[str, Any], gap: Mapping[str, Any] | None) -> None:
+def _unexplained(page: Page, left: Mapping[str, Any], force: Mapping[str, Any] | None) -> None:
     page.subheading("What stays unexplained")
     page.table(
         ["quantity", "value", "unit"],
         [
             ["residual over all frames, RMS", _number(left["rmse_mm"]), "mm"],
             ["noise floor", _number(left["noise_floor_mm"]), "mm"],
-            ["worst frame", _number(left["worst_frame"]), ""],
-            ["residual there, RMS", _number(left["worst_frame_rmse_mm"]), "mm"],
-            ["middle of the worst tenth of the body, at frame 0", left["worst_place_at_frame_0_m"], "m"],
+            ["worst time", _number(left["worst_time_s"]), "s"],
+            ["residual there, RMS", _number(left["worst_instant_rmse_mm"]), "mm"],
+            ["middle of the worst tenth of the body, at frame 0", left["worst_place_at_start_m"], "m"],
             ["residual of that tenth, RMS", _number(left["worst_place_rmse_mm"]), "mm"],
         ],
     )
-    if gap is not None:
-        errors = f"{number(_number(gap['fit_rmse_mm']))} mm"
-        if gap["held_out_rmse_mm"] is not None:
-            errors += f", {number(_number(gap['held_out_rmse_mm']))} mm held out"
+    if force is not None:
+        errors = f"{number(_number(force['fit_rmse_mm']))} mm"
+        if force["held_out_rmse_mm"] is not None:
+            errors += f", {number(_number(force['held_out_rmse_mm']))} mm held out"
         page.note(
-            "Stop-gap, not an explanation: a force that changes smoothly in time and space, without a known cause, "
-            f"leaves {errors}. The twin has it as smooth force, to be used meanwhile; it holds for this throw alone."
+            "A force that changes smoothly in time and space and stands in for the discrepancy, without a known cause, "
+            f"leaves {errors}. The twin has it as smooth force, to be used meanwhile; it holds for this motion alone."
         )
 
 
-def _next_throw(page: Page, proposal: Mapping[str, Any] | None) -> None:
+def _next_experiment(page: Page, proposal: Mapping[str, Any] | None) -> None:
     if proposal is None:
         return
-    page.subheading("The throw to film next")
-    velocity, spin = proposal["velocity"], proposal["omega"]
+    page.subheading("The initial state to film next")
+    velocity, spin = proposal["initial_velocity"], proposal["initial_omega"]
     page.note(
-        f"{' and '.join(map(words, proposal['tells_apart']))} look alike in this throw "
-        f"({number(_number(proposal['difference_in_this_throw_mm']))} mm apart). Thrown at {number(velocity['value'])} "
-        f"{velocity['unit']} with a spin of {number(spin['value'])} {spin['unit']}, they would be "
-        f"{number(_number(proposal['predicted_difference_mm']))} mm apart."
+        f"{' and '.join(map(words, proposal['distinguishes']))} look alike in this motion "
+        f"({number(_number(proposal['present_difference_mm']))} mm apart). With an initial velocity of "
+        f"{number(velocity['value'])} {velocity['unit']} and a spin of {number(spin['value'])} {spin['unit']} they "
+        f"would be {number(_number(proposal['predicted_difference_mm']))} mm apart."
     )
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    """An effect and whom it acts on."""
+    scope = row.get("scope", "all")
+    return words(row["effect"]) if scope == "all" else f"{words(row['effect'])} ({scope})"
 
 
 def _number(value: Any) -> float | None:

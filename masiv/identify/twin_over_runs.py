@@ -1,0 +1,62 @@
+"""A twin over the runs of a scene of tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from masiv.config import Config
+from masiv.identify.from_tracks import group_of
+from masiv.identify.tracks import family_of, only_body, simulation_of
+from masiv.inference.model_fit import rms_mm
+from masiv.models.clamped_body import BodyRun, BodySimulation
+from masiv.models.free_body import Model
+from masiv.models.point_mass import RIGID, PointRun, PointSimulation, point_runs
+from masiv.simulation.fitted_twin import effect_values, law_values, start_values
+from masiv.tracks.tracks import Tracks
+from masiv.twin import Twin
+
+
+@dataclass(frozen=True)
+class TwinSimulation:
+    """A twin's forward model of runs: their model with its values."""
+
+    simulation: BodySimulation | PointSimulation
+    model: Model
+    values: dict[str, float]
+
+    def fields(self) -> list[np.ndarray]:
+        """Simulated less observed (T, N, A) [m] of all runs, over all of their instants."""
+        return self.simulation.fields(self.model, self.values, held_out=True)
+
+
+def simulated(tracks: Tracks, twin: Twin, config: Config, condition: str | None = None) -> TwinSimulation:
+    """``twin`` over the runs of ``condition`` (None: the first)."""
+    group = group_of(tracks)
+    if group is not None:
+        points = PointSimulation(tracks, point_runs(tracks, group))
+        terms = [(e, points.made(e.name, e.bodies).name) for e in twin.effects]
+        values = {n: v for e, term in terms for n, v in effect_values(e, term).items()}
+        return TwinSimulation(
+            points, Model(RIGID, "none", tuple(term for _, term in terms)), {**start_values(twin), **values}
+        )
+    twin = twin.in_condition(condition)
+    law = law_values(twin)
+    simulation = simulation_of(tracks, twin.conditions[0], config.tracks, config.simulator, known=law)
+    model = Model(
+        family_of(twin.law.kind, only_body(tracks).density or 1e3, law),
+        "sticky" if simulation.ground else "none",
+        tuple(e.name for e in twin.effects),
+    )
+    values = {n: v for e in twin.effects for n, v in effect_values(e, e.name).items()}
+    return TwinSimulation(simulation, model, {**start_values(twin), **values})
+
+
+def run_errors(runs: Sequence[BodyRun | PointRun], fields: Sequence[np.ndarray]) -> list[dict]:
+    """Root mean square distance of each run [mm]."""
+    return [
+        {"run": run.name, "use": "fit" if run.fitted else "hold_out", "rmse_mm": rms_mm([f]), "instants": len(f)}
+        for run, f in zip(runs, fields, strict=True)
+    ]

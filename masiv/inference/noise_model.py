@@ -1,0 +1,159 @@
+"""The noise model of a set of observations: what residuals may be with nothing missing.
+
+Of each observation: ``noise_std`` [m], the measurement; ``residual_std`` (T,) [m], measurement and discretization
+together, by which residuals are whitened; and correlations in space and time, which are estimated from a residual
+(``masiv.inference.smooth_noise``). Two regimes: instants that are *observation-limited*, simulated as well as they are
+observed, and the others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from masiv.inference.smooth_noise import SmoothNoise, covariance_of, estimate_smooth_noise
+from masiv.models.base import Observation
+
+OBSERVATION_LIMITED_RATIO = 1.5
+"""``residual_std`` over ``noise_std`` below which an instant is observation-limited."""
+MAX_POINTS, DISTANCE_BINS = 400, 24
+"""Points, and bins of their distances, of which ``effective_samples`` takes the correlation."""
+
+
+@dataclass(frozen=True)
+class RegimeMeans:
+    """Means over fitted instants of a quantity over its variance. None: no instant is of that regime."""
+
+    observation_limited: float | None
+    model_limited: float | None
+
+    @property
+    def largest(self) -> float:
+        return max(mean for mean in (self.observation_limited, self.model_limited) if mean is not None)
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """See the module. Fields are residuals (T, N, A) [m] of each observation over all instants, squares (T,) [m²] their
+    mean squares; the residual of a fit (M,) is what ``whiten`` makes of the fitted instants."""
+
+    observations: Sequence[Observation]
+
+    def whiten(self, fitted: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Fields of fitted instants, divided by ``residual_std`` and multiplied by ``noise_std`` [m]."""
+        return [e.whiten(f) for f, e in zip(fitted, self.observations, strict=True)]
+
+    def effective_samples(self, whitened: Sequence[np.ndarray]) -> int:
+        """How many independent residuals the fitted instants are worth."""
+        return sum(
+            effective_samples(f, e.points) for f, e in zip(whitened, self.observations, strict=True) if e.fit_count
+        )
+
+    # -- variances -----------------------------------------------------------------------------------------------
+
+    def over_variance(self, squares: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Mean squares (T,) of each observation over the variances of its residuals."""
+        return [s / e.residual_std**2 for s, e in zip(squares, self.observations, strict=True)]
+
+    def by_regime(self, ratios: Sequence[np.ndarray]) -> RegimeMeans:
+        """Means of ``ratios`` (T,) of each observation over the fitted instants of each regime."""
+        limited, others = [], []
+        for ratio, e in zip(ratios, self.observations, strict=True):
+            known = observation_limited(e)
+            limited.append(ratio[: e.fit_count][known])
+            others.append(ratio[: e.fit_count][~known])
+        means = (float(part.mean()) if len(part) else None for part in map(np.concatenate, (limited, others)))
+        return RegimeMeans(*means)
+
+    def reduced_chi(self, squares: Sequence[np.ndarray]) -> float:
+        """Root mean square residual over ``residual_std``, of the fitted instants of the regime where it is largest:
+        about 1 if nothing is missing."""
+        return math.sqrt(self.by_regime(self.over_variance(squares)).largest)
+
+    def held_out(self, squares: Sequence[np.ndarray]) -> np.ndarray:
+        """Mean squares over variances at the held-out instants of all observations (H,)."""
+        ratios = zip(self.over_variance(squares), self.observations, strict=True)
+        parts = [ratio[e.fit_count :] for ratio, e in ratios if e.holds_out]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    # -- correlations --------------------------------------------------------------------------------------------
+
+    def estimator_covariance(
+        self, residual: np.ndarray, jacobian: np.ndarray, estimator: np.ndarray
+    ) -> np.ndarray | None:
+        """Covariance (Q, Q) of ``estimator`` (M, Q) times a noise as smooth as what the fit with ``jacobian`` (M, P)
+        left, ``residual`` (M,) [m]. None if the residual is too short, or has too few points, to tell how smooth.
+
+        The smoothness is that of the observation-limited instants, of the observation's errors alone. Elsewhere
+        residuals are as much larger as they are found to be.
+        """
+        total = np.zeros((estimator.shape[1],) * 2)
+        for observation, part in self._parts(residual.size):
+            field = residual[part].reshape(observation.fit_count, len(observation.points), -1)
+            noise, scale = _smooth_noise(field, jacobian[part].reshape(*field.shape, -1), observation)
+            if noise is None:
+                return None
+            total += covariance_of(estimator[part].reshape(*field.shape, -1), noise, observation.points, scale)
+        return total
+
+    def _parts(self, size: int) -> Iterator[tuple[Observation, slice]]:
+        """What of a residual of ``size`` is of which observation; all are measured in as many axes."""
+        fitted = [e for e in self.observations if e.fit_count]
+        axes = size // sum(e.fit_count * len(e.points) for e in fitted)
+        begin = 0
+        for e in fitted:
+            end = begin + e.fit_count * len(e.points) * axes
+            yield e, slice(begin, end)
+            begin = end
+
+
+def observation_limited(observation: Observation) -> np.ndarray:
+    """Which fitted instants (fit_count,) are simulated as well as they are observed."""
+    return observation.residual_std[: observation.fit_count] < OBSERVATION_LIMITED_RATIO * observation.noise_std
+
+
+def _smooth_noise(
+    field: np.ndarray, sensitivities: np.ndarray, observation: Observation
+) -> tuple[SmoothNoise | None, np.ndarray]:
+    """The noise in a residual ``field`` (T, N, A), and how much larger it is at each instant (T,)."""
+    known = observation_limited(observation)
+    noise = estimate_smooth_noise(field[known], sensitivities[known], observation.points)
+    if noise is None:  # too few instants of that regime: all of them
+        return estimate_smooth_noise(field, sensitivities, observation.points), np.ones(len(field))
+    squares = (field**2).mean((1, 2))
+    here, there = (float(squares[part].mean()) if part.any() else 0.0 for part in (known, ~known))
+    return noise, np.where(known, 1.0, math.sqrt(max(1.0, there / here)))
+
+
+def effective_samples(field: np.ndarray, points: np.ndarray) -> int:
+    """How many independent values a ``field`` (T, N, A) of correlated residuals of N ``points`` (N, 3) [m] is worth.
+
+    A × times × places: n values with correlations ρ are worth n² / Σ ρ², the participation ratio of their covariance; ρ
+    is taken as a function of time lag, and of distance at the start. An estimate: the field is treated as stationary,
+    and time and space as separable.
+    """
+    instants, count, axes = field.shape
+    variance = float((field**2).mean())
+    if variance == 0.0:
+        return field.size
+    lags = [float((field[k:] * field[: instants - k]).mean()) / variance for k in range(instants)]
+    lag = np.abs(np.subtract.outer(np.arange(instants), np.arange(instants)))
+    times = instants**2 / float((np.clip(lags, -1, 1)[lag] ** 2).sum())
+    chosen = np.sort(np.random.default_rng(0).choice(count, min(MAX_POINTS, count), replace=False))
+    some = field[:, chosen]
+    product = np.einsum("kia,kja->ij", some, some) / (axes * instants * variance)
+    distance = np.linalg.norm(points[chosen][:, None] - points[chosen][None], axis=2)
+    upper = np.triu_indices(len(chosen), 1)
+    if len(upper[0]) == 0:
+        return max(1, round(axes * times))
+    edges = np.linspace(0, distance.max() * 1.001, DISTANCE_BINS + 1)
+    index = np.digitize(distance[upper], edges) - 1
+    weight = np.bincount(index, minlength=DISTANCE_BINS)
+    sums = np.bincount(index, product[upper], minlength=DISTANCE_BINS)
+    rho = np.clip(sums / np.maximum(weight, 1), -1, 1)
+    squares = float((weight * rho**2).sum() / weight.sum())
+    places = 1 / (1 / count + (1 - 1 / count) * squares)
+    return max(1, round(axes * times * places))

@@ -1,0 +1,59 @@
+"""Frames that were read, up to a number of bytes; the one that was not used for the longest time is dropped first."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+MAX_BYTES = 2 << 30
+"""Of the frames that one scene keeps [bytes]."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of one view.
+
+    image (H, W, 3) uint8 RGB; mask (H, W) float32 in [0, 1], 1 on the object; valid (H, W) bool, False if an occluder
+    hides the scene or there is no picture.
+    """
+
+    image: np.ndarray
+    mask: np.ndarray
+    valid: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays [bytes]."""
+        return self.image.nbytes + self.mask.nbytes + self.valid.nbytes
+
+
+class FrameCache:
+    """``load(view, frame)``, which reads a ``Frame``, with the frames that were read last, at most ``max_bytes``."""
+
+    def __init__(self, load: Callable[[int, int], Frame], max_bytes: int = MAX_BYTES) -> None:
+        self.load = load
+        self.max_bytes = max_bytes
+        self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
+        self._bytes = 0
+
+    def __call__(self, view: int, frame: int) -> Frame:
+        """The frame, read again if it was dropped."""
+        key = view, frame
+        if key in self._frames:
+            self._frames.move_to_end(key)
+            return self._frames[key]
+        found = self.load(view, frame)
+        self._frames[key] = found
+        self._bytes += found.nbytes
+        while self._bytes > self.max_bytes and len(self._frames) > 1:
+            _, oldest = self._frames.popitem(last=False)
+            self._bytes -= oldest.nbytes
+        return found
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled without its frames: another process reads those that it needs."""
+        return FrameCache, (self.load, self.max_bytes)

@@ -1,0 +1,58 @@
+"""Rollouts of a deformable body that is held at rest and then let go: a body with markers."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from masiv.errors import InputError
+from masiv.models.marker_body import SimulatedBody, placed_body, plan
+from masiv.mpm.rollout import rollout
+from masiv.simulation.rollout import Rollout
+from masiv.simulation.twin_effects import effect_members
+from masiv.twin import Twin
+
+
+@torch.no_grad()
+def simulate_release(twin: Twin, *, frames: int, fps: float) -> Rollout:
+    """``frames`` frames at k / fps [s] after the release of the only body of ``twin``. Raises InputError,
+    NonFiniteError."""
+    body = released_body(twin)
+    release = twin.initial_conditions[0].release
+    assert release is not None
+    if frames < 2:
+        raise InputError(f"--frames {frames}: give at least 2")
+    times = np.arange(frames) / fps
+    planned = plan(body, twin.law, times, twin.simulator, speed=release.max_speed)
+    effects = body.effects(effect_members(twin, twin.body), duration=float(times[-1]), frame_time=1 / fps)
+    outputs = sorted(set(planned.outputs))
+    state = body.released(planned.simulator.dtype)
+    positions = rollout(planned.simulator, twin.law, state, planned.steps, outputs, effects)
+    positions = positions[[outputs.index(step) for step in planned.outputs]]
+    world = body.frame.points_to_world(positions.double().numpy())
+    return Rollout(world.astype(np.float32), times, body.markers_to_world(positions), tuple(release.markers))
+
+
+def released_body(twin: Twin) -> SimulatedBody:
+    """The only body of ``twin`` at its place in the first observation. Raises InputError if that is not a release."""
+    body, start = twin.body, twin.initial_conditions[0]
+    if body.particles is None or body.particle_spacing is None or start.placement is None or start.release is None:
+        raise InputError(f"body {body.name} needs particles and a placement in {start.observation} to be let go there")
+    markers = start.release.markers
+    if not markers:
+        raise InputError(f"{start.observation}: no marker with all three axes moves with the material")
+    return placed_body(
+        body.particles,
+        body.volume,
+        body.density,
+        twin.simulator,
+        particle_spacing=body.particle_spacing,
+        placement=start.placement,
+        clamp=body.clamp,
+        at_rest=np.array(list(markers.values())),
+        markers=tuple(range(len(markers))),
+        up=twin.up,
+        gravity=twin.gravity,
+        ground=twin.ground,
+        contact=twin.contact,
+    )

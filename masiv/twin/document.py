@@ -1,0 +1,415 @@
+"""twin.yaml of schema 2, with its laws and particles in files alongside it. Schema 1: ``masiv.twin.schema1``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from masiv.errors import InputError
+from masiv.files import atomic, write_yaml
+from masiv.mpm.config import SimulatorConfig
+from masiv.scene.scene import Ground
+from masiv.strict import read_yaml, validated
+from masiv.tracks.placement import Placement
+from masiv.tracks.tracks import Clamp
+from masiv.twin.body import OFFSET_UNITS, Body, Boundary, InitialCondition, Release, TwinEffect
+
+SCHEMA = 2
+TWIN_FILE = "twin.yaml"
+
+Unit = TypeVar("Unit")
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+FileName = Annotated[str, Field(pattern=r"^[^/\\]+$")]
+
+
+class Part(BaseModel):
+    """A mapping in the file: no other keys, no NaN, no text for a number."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Scalar(Part, Generic[Unit]):
+    value: float
+    unit: Unit
+
+
+class Positive(Part, Generic[Unit]):
+    value: Annotated[float, Field(gt=0)]
+    unit: Unit
+
+
+class Vector3(Part, Generic[Unit]):
+    value: Vector
+    unit: Unit
+
+
+class ParameterPart(Part):
+    value: float
+    unit: str
+    stderr: Annotated[float, Field(ge=0)] | None = None
+
+
+class EffectPart(Part):
+    effect: str
+    bodies: list[str] = []
+    condition: str | None = None
+    parameters: dict[str, ParameterPart]
+    place: Vector3[Literal["m"]] | None = None
+
+
+class LawPart(BaseModel):
+    """kind and parameters are for the reader: the law itself is in ``file``."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    kind: str
+    file: FileName
+
+
+class ParticlesPart(Part):
+    file: FileName
+    tensor: str
+    spacing: Positive[Literal["m"]] | None = None
+
+
+class ClampPart(Part):
+    normals: list[Vector]
+    heights: list[float]
+    markers: list[str]
+
+
+class DragPart(Part):
+    diameter: Positive[Literal["m"]]
+    mass: Positive[Literal["kg"]]
+    medium_density: Scalar[Literal["kg/m^3"]]
+    medium_viscosity: Scalar[Literal["Pa s"]]
+
+
+class BodyPart(Part):
+    name: str
+    law: LawPart | None
+    particles: ParticlesPart | None
+    volume: Positive[Literal["m^3"]]
+    density: Positive[Literal["kg/m^3"]]
+    geometry: str | None = None
+    clamp: ClampPart | None = None
+    drag: DragPart | None = None
+
+
+class GroundPart(Part):
+    normal: Vector
+    height: Scalar[Literal["m"]]
+
+
+class BoundaryPart(Part):
+    ground: GroundPart | None
+    contact: Literal["sticky", "release", "slip", "none"]
+    friction: Annotated[float, Field(ge=0)]
+
+
+class PlacementPart(Part):
+    rotation: Annotated[list[Vector], Field(min_length=3, max_length=3)]
+    translation: Vector3[Literal["m"]]
+    error: Scalar[Literal["m"]]
+
+
+class OffsetsPart(Part):
+    """Those of ``OFFSET_UNITS``."""
+
+    release: Scalar[Literal["s"]] | None = None
+    lateral_offset_1: Scalar[Literal["m"]] | None = None
+    lateral_offset_2: Scalar[Literal["m"]] | None = None
+    vertical_offset: Scalar[Literal["m"]] | None = None
+    tip_deflection: Scalar[Literal["m"]] | None = None
+
+
+class ReleasePart(Part):
+    markers: dict[str, Vector3[Literal["m"]]]
+    max_speed: Scalar[Literal["m/s"]]
+    offsets: OffsetsPart
+
+
+class InitialConditionPart(Part):
+    observation: str
+    body: str
+    condition: str = ""
+    fps: Annotated[float, Field(gt=0)]
+    velocity: Vector3[Literal["m/s"]]
+    omega: Vector3[Literal["rad/s"]]
+    placement: PlacementPart | None = None
+    release: ReleasePart | None = None
+
+
+class Document(Part):
+    """twin.yaml. Lists have one entry for each body, each observation and each effect."""
+
+    schema_: Annotated[Literal[2], Field(alias="schema")]
+    bodies: Annotated[list[BodyPart], Field(min_length=1)]
+    initial_conditions: Annotated[list[InitialConditionPart], Field(min_length=1)]
+    gravity: Vector3[Literal["m/s^2"]]
+    boundary: BoundaryPart
+    up: Vector
+    effects: list[EffectPart]
+    simulator: SimulatorConfig
+    fit: dict[str, Any]
+
+
+# ---- writing --------------------------------------------------------------------------------------------------------
+
+
+def write_document(twin: Mapping[str, Any], folder: Path, name: str = TWIN_FILE) -> None:
+    """Write the fields of a ``Twin`` to ``name`` in ``folder``, each file complete or not at all."""
+    suffix = name.removeprefix("twin").removesuffix(".yaml")
+    particles_file = f"particles{suffix}.safetensors"
+    bodies, tensors = [], {}
+    for index, body in enumerate(twin["bodies"]):
+        law_file = f"law{suffix}{f'.{index}' if index else ''}.safetensors"
+        if body.law is not None:
+            body.law.save(folder / law_file)
+        if body.particles is not None:
+            tensors[body.name] = np.ascontiguousarray(body.particles)
+        bodies.append(_body_entry(body, law_file, particles_file))
+    if tensors:
+        with atomic(folder / particles_file) as temporary:
+            save_file(tensors, temporary)
+    boundary: Boundary = twin["boundary"]
+    ground = None
+    if boundary.ground is not None:
+        ground = {"normal": _floats(boundary.ground.normal), "height": _quantity(boundary.ground.height, "m")}
+    document = {
+        "schema": SCHEMA,
+        "bodies": bodies,
+        "initial_conditions": [_initial_condition_entry(start) for start in twin["initial_conditions"]],
+        "gravity": _quantity(twin["gravity"], "m/s^2"),
+        "boundary": {"ground": ground, "contact": boundary.contact, "friction": float(boundary.friction)},
+        "up": _floats(twin["up"]),
+        "effects": [_effect_entry(effect) for effect in twin["effects"]],
+        "simulator": twin["simulator"].model_dump(),
+        "fit": twin["fit"],
+    }
+    write_yaml(folder / name, document)
+
+
+def _body_entry(body: Body, law_file: str, particles_file: str) -> dict[str, Any]:
+    particles, clamp, drag = None, None, None
+    if body.particles is not None:
+        spacing = None if body.particle_spacing is None else _quantity(body.particle_spacing, "m")
+        particles = {"file": particles_file, "tensor": body.name, "spacing": spacing}
+    if body.clamp is not None:
+        clamp = {
+            "normals": [_floats(normal) for normal in body.clamp.normals],
+            "heights": _floats(body.clamp.heights),
+            "markers": list(body.clamp.markers),
+        }
+    if body.drag is not None:
+        drag = {
+            "diameter": _quantity(body.drag.diameter, "m"),
+            "mass": _quantity(body.drag.mass, "kg"),
+            "medium_density": _quantity(body.drag.medium_density, "kg/m^3"),
+            "medium_viscosity": _quantity(body.drag.medium_viscosity, "Pa s"),
+        }
+    return {
+        "name": body.name,
+        "law": None if body.law is None else {**body.law.description(), "file": law_file},
+        "particles": particles,
+        "volume": _quantity(body.volume, "m^3"),
+        "density": _quantity(body.density, "kg/m^3"),
+        "geometry": body.geometry,
+        "clamp": clamp,
+        "drag": drag,
+    }
+
+
+def _initial_condition_entry(start: InitialCondition) -> dict[str, Any]:
+    placement, release = None, None
+    if start.placement is not None:
+        placement = {
+            "rotation": [_floats(row) for row in start.placement.rotation],
+            "translation": _quantity(start.placement.translation, "m"),
+            "error": _quantity(start.placement.error, "m"),
+        }
+    if start.release is not None:
+        release = {
+            "markers": {name: _quantity(place, "m") for name, place in start.release.markers.items()},
+            "max_speed": _quantity(start.release.max_speed, "m/s"),
+            "offsets": {name: _quantity(value, OFFSET_UNITS[name]) for name, value in start.release.offsets.items()},
+        }
+    return {
+        "observation": start.observation,
+        "body": start.body,
+        "condition": start.condition,
+        "fps": float(start.fps),
+        "velocity": _quantity(start.velocity, "m/s"),
+        "omega": _quantity(start.omega, "rad/s"),
+        "placement": placement,
+        "release": release,
+    }
+
+
+def _effect_entry(effect: TwinEffect) -> dict[str, Any]:
+    parameters = {
+        name: {"value": float(value), "unit": unit, "stderr": None if stderr is None else float(stderr)}
+        for name, value, unit, stderr in effect.rows()
+    }
+    return {
+        "effect": effect.name,
+        "bodies": list(effect.bodies),
+        "condition": effect.condition,
+        "parameters": parameters,
+        "place": None if effect.place is None else _quantity(np.array(effect.place), "m"),
+    }
+
+
+def _floats(values: np.ndarray) -> list[float]:
+    return [float(v) for v in values]  # YAML knows no numpy scalar
+
+
+def _quantity(value: float | np.ndarray, unit: str) -> dict[str, Any]:
+    return {"value": _floats(np.asarray(value)) if np.ndim(value) else float(value), "unit": unit}
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+def read_document(
+    folder: Path, name: str = TWIN_FILE, scene: Callable[[], Mapping[str, Any]] | None = None
+) -> dict[str, Any]:
+    """The fields of the ``Twin`` in ``name`` in ``folder``; scene: see ``Twin.load``. Raises InputError."""
+    path = folder / name
+    if not path.is_file():
+        raise InputError(f"{folder} holds no {name}: run masiv identify")
+    data = read_yaml(path)
+    if data.get("schema") == 1:
+        from masiv.twin.schema1 import read_schema1
+
+        return read_schema1(data, path, scene)
+    if data.get("schema") != SCHEMA:
+        raise InputError(f"{path} has schema {data.get('schema')}, this masiv reads 1 and {SCHEMA}: identify again")
+    document = validated(Document, data, str(path))
+    bodies = tuple(_body(part, f"{path}: 'bodies.{k}", folder) for k, part in enumerate(document.bodies))
+    starts = tuple(_initial_condition(part) for part in document.initial_conditions)
+    effects = tuple(read_effect(part, f"{path}: 'effects.{k}") for k, part in enumerate(document.effects))
+    check_names(path, bodies, starts, effects)
+    ground = document.boundary.ground
+    if ground is not None:
+        ground = Ground(np.array(ground.normal), ground.height.value)
+    return {
+        "bodies": bodies,
+        "boundary": Boundary(ground, document.boundary.contact, document.boundary.friction),
+        "gravity": np.array(document.gravity.value),
+        "up": np.array(document.up),
+        "initial_conditions": starts,
+        "simulator": document.simulator,
+        "effects": effects,
+        "fit": document.fit,
+    }
+
+
+def _body(part: BodyPart, where: str, folder: Path) -> Body:
+    from masiv.effects.per_body import DragBody
+    from masiv.materials.load import load_law
+
+    law = None
+    if part.law is not None:
+        law = load_law(folder / part.law.file)
+        if law.kind != part.law.kind:
+            raise InputError(f"{where}.law.kind' is {part.law.kind!r}, but {part.law.file} holds a {law.kind} law")
+    particles, spacing = None, None
+    if part.particles is not None:
+        particles = read_particles(folder / part.particles.file, part.particles.tensor)
+        spacing = None if part.particles.spacing is None else part.particles.spacing.value
+    if law is not None and particles is None:
+        raise InputError(f"{where}.particles' is missing: a body that deforms consists of particles")
+    clamp = None
+    if part.clamp is not None:
+        if len(part.clamp.normals) != len(part.clamp.heights):
+            raise InputError(f"{where}.clamp' needs one height for each normal")
+        normals = np.array(part.clamp.normals).reshape(-1, 3)
+        clamp = Clamp(normals, np.array(part.clamp.heights), tuple(part.clamp.markers))
+    drag = None
+    if part.drag is not None:
+        d = part.drag
+        drag = DragBody(d.diameter.value, d.mass.value, d.medium_density.value, d.medium_viscosity.value)
+    return Body(
+        part.name, part.volume.value, part.density.value, law, particles, spacing, clamp, part.geometry, drag
+    )  # fmt: skip
+
+
+def read_particles(path: Path, tensor: str) -> np.ndarray:
+    """(Q, 3) [m]. Raises InputError if ``path`` does not hold finite positions under the name ``tensor``."""
+    try:
+        particles = load_file(path)[tensor]
+    except (OSError, KeyError, SafetensorError) as error:
+        raise InputError(f"{path} does not hold the particles of body '{tensor}' ({error}): identify again") from error
+    if particles.ndim != 2 or particles.shape[1] != 3 or not np.isfinite(particles).all():
+        raise InputError(f"{path}: '{tensor}' of shape {particles.shape} must be finite positions (Q, 3)")
+    return particles
+
+
+def _initial_condition(part: InitialConditionPart) -> InitialCondition:
+    placement, release = None, None
+    if part.placement is not None:
+        p = part.placement
+        placement = Placement(np.array(p.rotation), np.array(p.translation.value), p.error.value)
+    if part.release is not None:
+        offsets = {name: offset.value for name, offset in part.release.offsets if offset is not None}
+        markers = {name: np.array(place.value) for name, place in part.release.markers.items()}
+        release = Release(markers, part.release.max_speed.value, offsets)
+    return InitialCondition(
+        part.observation, part.body, part.fps, np.array(part.velocity.value), np.array(part.omega.value),
+        part.condition, placement, release,
+    )  # fmt: skip
+
+
+def read_effect(part: EffectPart, where: str) -> TwinEffect:
+    """Raises InputError for an effect or a parameter that the library does not have, and for a value out of bounds."""
+    place = None
+    if part.place is not None:
+        x, y, z = part.place.value
+        place = x, y, z
+    values = {name: float(row.value) for name, row in part.parameters.items()}
+    stderr = {name: None if row.stderr is None else float(row.stderr) for name, row in part.parameters.items()}
+    effect = TwinEffect(part.effect, values, stderr, tuple(part.bodies), part.condition, place)
+    try:
+        known = {p.name: p for p in effect.parameters}
+    except InputError as error:
+        raise InputError(f"{where}.effect' is {part.effect!r}: {error}") from error
+    for name, row in part.parameters.items():
+        key = f"{where}.parameters.{name}"
+        if name not in known:
+            raise InputError(f"{key}' is unknown: {part.effect} has the parameters {', '.join(known)}")
+        p = known[name]
+        if row.unit != p.unit:
+            raise InputError(f"{key}.unit' is {row.unit!r}: it must be {p.unit}")
+        if not p.lower <= row.value <= p.upper:
+            raise InputError(f"{key}.value' is {row.value}: it must lie between {p.lower:g} and {p.upper:g} {p.unit}")
+    for name, p in known.items():
+        if name not in values:
+            raise InputError(f"{where}.parameters.{name}' is missing: give it a value [{p.unit}]")
+    return effect
+
+
+def check_names(
+    path: Path, bodies: tuple[Body, ...], starts: tuple[InitialCondition, ...], effects: tuple[TwinEffect, ...]
+) -> None:
+    """Raises InputError if a name is given twice, or stands for no body."""
+    names = [body.name for body in bodies]
+    if len(set(names)) < len(names):
+        raise InputError(f"{path}: 'bodies' has two bodies of one name: {', '.join(names)}")
+    observed = [(start.observation, start.body) for start in starts]
+    for k, start in enumerate(starts):
+        if start.body not in names:
+            raise InputError(f"{path}: 'initial_conditions.{k}.body' is {start.body!r}: bodies are {', '.join(names)}")
+        if observed.index((start.observation, start.body)) < k:
+            raise InputError(f"{path}: 'initial_conditions.{k}' is a second one of {start.observation}: keep one")
+    for k, effect in enumerate(effects):
+        if unknown := [name for name in effect.bodies if name not in names]:
+            raise InputError(f"{path}: 'effects.{k}.bodies' has {unknown[0]!r}: bodies are {', '.join(names)}")
+        if any(effect.overlaps(other) for other in effects[:k]):
+            raise InputError(f"{path}: 'effects.{k}.effect': {effect.name} is there twice, keep one of them")

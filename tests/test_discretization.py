@@ -1,0 +1,105 @@
+"""What finer grids change: how uncertain it makes residuals and values. Closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from masiv.inference.discretization import with_grid_errors, with_residual_std
+from masiv.inference.model_fit import ModelFit
+from masiv.models.base import SharedRollouts, WeightedResidual
+from masiv.models.parameters import Parameter
+
+INSTANTS, ROWS, POINTS = 6, 4, 5
+NOISE = 1e-3
+
+
+@dataclass(frozen=True)
+class Observation(WeightedResidual):
+    noise_std: float = NOISE
+    residual_std: np.ndarray = None
+    time_count: int = INSTANTS
+    fit_count: int = ROWS
+    holds_out: bool = True
+    grid_changes: tuple[np.ndarray, ...] = ()
+
+
+class Changing(SharedRollouts):
+    """Finer grids make ``changes`` (T, N, 3) [m]."""
+
+    def __init__(self, *changes):
+        super().__init__()
+        self.changes = changes
+        self.observations = (Observation(residual_std=np.full(INSTANTS, NOISE)),)
+
+    def finer_grids(self, model, values, index):
+        return list(self.changes)
+
+
+def parameters():
+    return [Parameter("a", 0.0, -100.0, 100.0, 1e-3), Parameter("b", 0.0, -100.0, 2.0, 1e-3)]
+
+
+def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
+    random = np.random.default_rng(2)
+    jacobian = random.normal(size=(ROWS * POINTS * 3, 2))
+    shape = (INSTANTS, POINTS, 3)
+    absorbed = np.zeros(shape)
+    absorbed[:ROWS] = 1e-2 * (jacobian @ np.array([1.0, -2.0])).reshape(ROWS, POINTS, 3)
+    sizes = np.sqrt((absorbed[:ROWS] ** 2).sum(2).mean(1))
+    assert (sizes > 10 * NOISE).all()
+    fitted = SimpleNamespace(jacobian=jacobian, model=None, values={}, parameters=parameters())
+
+    def found(*changes, fitted=fitted):
+        given = Changing(*changes)
+        updated = with_residual_std(given, fitted, [np.full(INSTANTS, NOISE)])
+        np.testing.assert_array_equal(given.observations[0].residual_std, NOISE)  # the given one stays as it is
+        assert given.observations[0].grid_changes == ()
+        return updated.observations[0]
+
+    np.testing.assert_allclose(found(absorbed, 2 * absorbed).residual_std, NOISE, rtol=1e-6)
+    common, apart = 3e-2 * random.normal(size=shape), 1e-2 * random.normal(size=shape)
+    alike = found(common, 1.2 * common + absorbed)
+    np.testing.assert_allclose(alike.residual_std, NOISE, rtol=1e-6)
+    np.testing.assert_array_equal(alike.grid_changes, [common, 1.2 * common + absorbed])
+    differing = found(common + apart, common - apart)
+    rms = np.sqrt((apart**2).sum(2).mean(1))
+    # A third grid is off the mean of two by the square root of three times as much as they are.
+    assert (np.sqrt(differing.residual_std**2 - NOISE**2)[:ROWS] >= 0.8 * np.sqrt(3) * rms[:ROWS]).all()
+    assert (differing.residual_std <= 3 * np.maximum.accumulate(rms) + NOISE).all()
+    assert (np.diff(differing.residual_std) >= 0).all()
+    # What an earlier mean had absorbed does not count.
+    columns = np.concatenate([apart[:ROWS].reshape(-1, 1), jacobian], axis=1)
+    share = Parameter("grid_change@0", 0.0, -1.0, 3.0, 0.25)
+    again = SimpleNamespace(jacobian=columns, model=None, values={}, parameters=[share, *parameters()])
+    np.testing.assert_array_equal(
+        found(common + apart, common - apart, fitted=again).residual_std, differing.residual_std
+    )
+    assert found().grid_changes == ()
+    np.testing.assert_array_equal(found().residual_std, NOISE)
+
+
+def test_standard_errors_hold_what_one_more_grid_would_move():
+    random = np.random.default_rng(3)
+    jacobian = random.normal(size=(ROWS * POINTS * 3, 2))
+    common, apart = np.zeros((2, INSTANTS, POINTS, 3))
+    common[:ROWS] = 1e-2 * random.normal(size=(ROWS, POINTS, 3))
+    apart[:ROWS] = 1e-2 * (jacobian @ np.array([3.0, -0.5])).reshape(ROWS, POINTS, 3)
+    observations = Changing().observations
+    share = Parameter("grid_change@0", 0.0, -1.0, 3.0, 0.25)
+    values = {share.name: 0.7, "a": 1.0, "b": 2.0}
+    columns = np.concatenate([common[:ROWS].reshape(-1, 1), jacobian], axis=1)
+    params = [share, parameters()[0], Parameter("b", 1.0, 0.1, 9.0, 1e-3, log=True)]
+    errors = dict(zip(values, (0.1, 0.01, 0.02), strict=True))
+    fitted = ModelFit(None, values, tuple(params), np.zeros(len(jacobian)), columns, 1.0, 9, 1.0, 1.0, [], errors)
+    assert with_grid_errors(observations, fitted, 1.0) is fitted  # no grid is known to change anything
+    changes = (common + apart, common - apart)
+    observations = (replace(observations[0], grid_changes=changes),)
+    found = with_grid_errors(observations, fitted, 1.0).stderr
+    # The mean's own size is what its share is for; a third grid is off it by the square root of three times as much.
+    assert found[share.name] == pytest.approx(errors[share.name])
+    assert found["a"] == pytest.approx(np.hypot(0.01, np.sqrt(3) * 1e-2 * 3.0))
+    assert found["b"] == pytest.approx(np.hypot(0.02, np.sqrt(3) * 1e-2 * 0.5 * values["b"]))

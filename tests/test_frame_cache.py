@@ -1,0 +1,80 @@
+"""Frames that were read are kept, up to a number of bytes."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from pathlib import Path
+
+import numpy as np
+
+from masiv.scene.camera import Camera
+from masiv.scene.frame_cache import Frame, FrameCache
+from masiv.scene.scene import Scene
+
+SIZE = 10
+FRAME_BYTES = SIZE * SIZE * (3 + 4 + 1)
+
+
+class Reader:
+    """Makes frames and keeps which were asked for. ``level``: of all pixels."""
+
+    def __init__(self, level=0):
+        self.level = level
+        self.read = []
+
+    def __call__(self, view, frame):
+        self.read.append((view, frame))
+        shape = SIZE, SIZE
+        return Frame(np.full((*shape, 3), self.level, np.uint8), np.zeros(shape, np.float32), np.ones(shape, bool))
+
+
+def scene(load):
+    up = np.array([0.0, 1.0, 0.0])
+    cameras = tuple(Camera(str(k), SIZE, SIZE, np.eye(3), np.eye(4)) for k in range(3))
+    return Scene(Path("scene"), "test", 24.0, 4, cameras, -9.8 * up, up, None, 1000.0, load, "test")
+
+
+def test_the_memory_of_a_cache_is_bounded_and_the_oldest_frame_goes_first():
+    reader = Reader()
+    cache = FrameCache(reader, max_bytes=2 * FRAME_BYTES)
+    for frame in (0, 1, 0, 2, 0, 1):
+        cache(0, frame)
+    # 1 is dropped when 2 comes, since 0 was used after it; 2 is dropped when 1 comes back.
+    assert reader.read == [(0, 0), (0, 1), (0, 2), (0, 1)]
+
+
+def test_a_frame_larger_than_the_cache_is_returned():
+    reader = Reader()
+    cache = FrameCache(reader, max_bytes=1)
+    assert cache(0, 0) is cache(0, 0)
+    cache(0, 1)
+    cache(0, 0)
+    assert reader.read == [(0, 0), (0, 1), (0, 0)]
+
+
+def test_a_part_of_a_scene_shares_what_was_read():
+    reader = Reader()
+    whole = scene(reader)
+    whole.frame(1, 0)
+    whole.restricted(3, (0,)).frame(1, 0)
+    assert reader.read == [(1, 0)]
+
+
+def test_a_scene_with_another_reader_has_its_own_frames():
+    first, second = scene(Reader(1)), None
+    first.frame(0, 0)
+    second = dataclasses.replace(first, load=Reader(2))
+    assert second.frame(0, 0).image[0, 0, 0] == 2
+    assert first.frame(0, 0).image[0, 0, 0] == 1
+
+
+def test_a_scene_is_pickled_without_its_frames():
+    read = scene(Reader(1))
+    empty = len(pickle.dumps(read))
+    for frame in range(4):
+        read.frame(0, frame)
+    sent = pickle.loads(pickle.dumps(read))
+    assert len(pickle.dumps(read)) < empty + 100  # the reader has noted four keys
+    assert sent.frame(0, 3).image[0, 0, 0] == 1
+    assert sent.load.load.read == [*((0, k) for k in range(4)), (0, 3)]
