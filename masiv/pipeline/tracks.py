@@ -11,13 +11,13 @@ from urllib.parse import quote
 from masiv.config import Config
 from masiv.errors import InputError
 from masiv.files import write_json, write_npz
+from masiv.observations.identity import identity
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
 from masiv.pipeline.run import Run, settings
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder
 from masiv.strict import read_yaml
 from masiv.tracks.read import read_tracks
-from masiv.tracks.summary import identity
 from masiv.tracks.tracks import Tracks
 
 if TYPE_CHECKING:
