@@ -8,7 +8,6 @@ import pytest
 import torch
 from small import NODES, SUBSTEPS
 
-from masiv.effects.active import ActiveEffects
 from masiv.effects.bound import BoundEffects
 from masiv.errors import InputError, NonFiniteError
 from masiv.identify.neural.starting_law import with_scales
@@ -117,8 +116,8 @@ def test_substeps_and_gradients_equal_the_twin(law, contact):
         c = sim.constants
         for _ in range(steps):
             state = _substep(
-                state, law, mass=float(sim.mass[0]), volume=c["volume"], spacing=sim.spacing, substep=sim.substep,
-                gravity=c["gravity"], contact=contact,
+                state, law, mass=float(sim.mass[0]), volume=c.volume, spacing=sim.spacing, substep=sim.substep,
+                gravity=c.gravity, contact=contact,
             )  # fmt: skip
         return state.position
 
@@ -194,13 +193,13 @@ def test_rollout_is_bit_reproducible_and_segments_do_not_change_it():
 
 def test_substeps_launched_at_once_and_one_by_one_and_in_parts_are_the_same(monkeypatch):
     start = State(*(t.float() for t in blob(200, height=0.05).tensors()))
-    law, nothing = elastic(), ActiveEffects((), None)
+    law = elastic()
     ends = []
     for serial in (10**6, 0):
         monkeypatch.setattr("masiv.mpm.taped_rollout.SERIAL_PARTICLES", serial)
-        ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
+        ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40]).positions)
     monkeypatch.setattr(BoundEffects, "empty", False)  # launch by launch, as with effects
-    ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
+    ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40]).positions)
     for end in ends[1:]:
         np.testing.assert_allclose(end.numpy(), ends[0].numpy(), atol=1e-6)
 
