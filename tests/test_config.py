@@ -60,7 +60,9 @@ def test_keys_of_earlier_versions_are_read(tmp_path, old):
     new = RENAMED_KEYS[old]
     default = getattr(getattr(Config(), section), new)
     choices = get_args(type(getattr(Config(), section)).model_fields[new].annotation)
-    value = not default if isinstance(default, bool) else 0.25 if isinstance(default, float) else 151
+    value = not default if isinstance(default, bool) else 151
+    if isinstance(default, float):
+        value = 0.3 if default <= 1 else (default + 1) / 2  # within the bounds of every key
     value = choices[0] if choices else value
     from_file = load_config(None, write(tmp_path, f"{section}: {{{key}: {value}}}"))
     assert getattr(getattr(from_file, section), new) == value
