@@ -117,8 +117,8 @@ def test_substeps_and_gradients_equal_the_twin(law, contact):
         c = sim.constants
         for _ in range(steps):
             state = _substep(
-                state, law, mass=float(sim.mass[0]), volume=c["volume"], spacing=sim.spacing, substep=sim.substep,
-                gravity=c["gravity"], contact=contact,
+                state, law, mass=float(sim.mass[0]), volume=c.volume, spacing=sim.spacing, substep=sim.substep,
+                gravity=c.gravity, contact=contact,
             )  # fmt: skip
         return state.position
 
