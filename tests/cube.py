@@ -12,7 +12,7 @@ from small import SMALL
 
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.losses.objective import Objective
-from masiv.models.problem import Problem
+from masiv.models.filmed_body import FilmedBody
 from masiv.scene.scene import Frame, Ground, Scene
 from masiv.simulation.simulate import simulate
 from masiv.splat.rasteriser import render
@@ -102,4 +102,4 @@ def silhouettes_of(positions) -> Scene:
 
 def objective_of(filmed, seen, **changes) -> Objective:
     config = settings(**{"pictures": 4, "iterations": 16, **changes})
-    return Objective(Problem(filmed, seen[0], config, SMALL))
+    return Objective(FilmedBody(filmed, seen[0], SMALL, samples=config.samples_per_frame), config)
