@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 from cube import noisy, scene
+from law_examples import EXAMPLES, F64, gradients
 from scipy.spatial.transform import Rotation
 from small import NODES, SMALL, SUBSTEPS
-from test_laws import EXAMPLES, F64, gradients
 
 from masiv.checkpoint import Checkpoint
 from masiv.identify.config import IdentifyConfig
