@@ -111,6 +111,7 @@ def test_declaration(name):
         assert p.unit
         assert p.lower < p.upper
         assert 0 < p.step <= p.upper
+    assert effect.strengths >= 1
     assert all(p.lower <= 0 <= p.upper for p in effect.parameters[: effect.strengths])
     guesses = effect.guesses(setting(body()))
     assert 1 <= len(guesses) <= 12

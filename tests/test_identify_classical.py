@@ -74,6 +74,7 @@ def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(tmp_path):
         scene(), seen, config, SMALL, checkpoint=Checkpoint(path),
         progress=lambda stage, *_: stages.append(stage),
     )  # fmt: skip
+    assert stages
     assert not any("search" in stage for stage in stages)
     assert whole.law.description() == resumed.law.description()
     assert whole.fit == resumed.fit

@@ -30,6 +30,7 @@ def test_flight_is_that_of_the_closed_form(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.5)}
     tracks = write_scene(tmp_path, balls, noise=0.0)
     simulation = PointMassModel(tracks, flight_observations(tracks, "balls"))
+    assert len(simulation.observations) == 4
     for run in simulation.observations:
         ball = balls[run.body]
         model = Model(RIGID, "none", ("quadratic_drag",) if ball.drag else ())
@@ -65,6 +66,7 @@ def test_own_coefficients_and_a_body_that_lacks_nothing(tmp_path):
     # One gravity of its own a ball would fit as well as drag, nearly; one of all does not.
     gravity = next(t for t in refined.search.rounds[0].trials if t.candidate.effect == "gravity_scale")
     assert any("heavy does not share it" in reason for reason in gravity.objections)
+    assert refined.search.rounds[0].candidates
     assert not any(c.effect.startswith("gravity_scale@") for c in refined.search.rounds[0].candidates)
     linear = next(t for t in refined.search.rounds[0].trials if t.candidate.effect == "linear_drag")
     assert any("it takes a medium of" in reason for reason in linear.objections)

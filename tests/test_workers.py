@@ -132,11 +132,13 @@ def test_results_come_in_order_and_a_failure_is_one_of_them(two):
     assert [f[0] for f in found[::2]] == [0, 1, 2, 3, 4]
     assert [f.reason for f in found[1::2]] == [f"{k} is odd" for k in (1, 3, 5, 7, 9)]
     assert os.getpid() not in {f[1] for f in found[::2]}
-    assert all(isinstance(f, TaskError) for f in Workers(1).map(halved, [(1,), (3,)]))
+    assert [isinstance(f, TaskError) for f in Workers(1).map(halved, [(1,), (3,)])] == [True, True]
 
 
 def test_bad_input_stays_bad_input(two):
-    for found in two.map(blamed, [(), ()]):
+    results = list(two.map(blamed, [(), ()]))
+    assert len(results) == 2
+    for found in results:
         with pytest.raises(InputError, match="no such effect"):
             unwrap(found)
 
