@@ -14,6 +14,7 @@ from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import InputError
 from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
 from masiv.mpm.config import SimulatorConfig
+from masiv.refine.config import RENAMED_KEYS as REFINE_RENAMED_KEYS
 from masiv.refine.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
 from masiv.strict import read_yaml, validated
@@ -28,11 +29,13 @@ RENAMED_KEYS = {
     "trajectory.carve_misses": "carve_images",
     "trajectory.batch": "batch_size",
     "trajectory.match_every": "match_interval",
+    "simulator.split": "subparticles",
     "identify.polish": "surface_finetune",
     "identify.polish_silhouette_weight": "finetune_silhouette_weight",
     "identify.paint_weight": "color_weight",
     "identify.polish_paint_weight": "finetune_color_weight",
     "tracks.highest_poissons_ratio": "max_poissons_ratio",
+    **{f"refine.{old}": new for old, new in REFINE_RENAMED_KEYS.items()},
 }
 """Keys of earlier versions: section and old name -> new name in the same section."""
 RENAMED_VALUES = {"identify.start": RENAMED_STARTS}

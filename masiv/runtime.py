@@ -1,4 +1,7 @@
-"""The one place where Taichi and torch are started."""
+"""Taichi and torch are started here, and nowhere else.
+
+Global state of a process: Taichi and its arch (``start``), and the fields and kernels of ``masiv.mpm.simulator``.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ def start(arch: str = "cpu") -> Any:
     known = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
     if arch not in known:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, where stdout may be for one JSON object
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, and stdout may be for one JSON object
         # One of Taichi's own passes is half of a kernel's compilation, and LLVM does its work again; see ``adjoint``.
         ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, cfg_optimization=False)
     atexit.register(ti.reset)  # writes the kernel cache, which the next command starts from
@@ -44,10 +47,11 @@ def start(arch: str = "cpu") -> Any:
 
 
 def adjoint(kernel: Any, *arguments: Any) -> None:
-    """Run what Taichi's autodiff makes of ``kernel``.
+    """Run the adjoint of ``kernel`` by Taichi's autodiff.
 
-    It is compiled with the pass that ``start`` turns off: without it, Taichi 1.7.4 loses terms of a derivative in
-    float32, and says nothing (of v / (1 + c |v|) all of that by v).
+    It is compiled with the pass that ``start`` turns off: without it, Taichi 1.7.4 silently loses terms of a derivative
+    in float32 (of v / (1 + c |v|) all of that by v). The switch is of the whole process: no other thread may compile a
+    kernel at the same time.
     """
     import taichi as ti
 
@@ -60,7 +64,7 @@ def adjoint(kernel: Any, *arguments: Any) -> None:
 
 
 def running_arch() -> str:
-    """The arch that Taichi runs on; cpu where it has not been started."""
+    """The arch that Taichi runs on; cpu if it has not been started."""
     return _started or "cpu"
 
 

@@ -23,11 +23,15 @@ class ShapeSpec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: Literal["cube", "sphere", "capsule", "cylinder", "torus", "cross", "mesh"] = "cube"
-    mesh: Path | None = Field(None, description="a watertight triangle mesh, for kind mesh; relative to the spec")
-    size: float = Field(0.5, gt=0, description="longest side [m]")
-    rotation_deg: tuple[float, float, float] = Field((0, 0, 0), description="about the fixed axes x, then y, then z")
-    position: tuple[float, float] = Field((0, 0), description="x, z of the box's centre [m]")
-    clearance: float = Field(0.15, ge=0, description="lowest point above the ground [m]")
+    mesh: Path | None = Field(
+        default=None, description="a watertight triangle mesh, for kind mesh; relative to the spec"
+    )
+    size: float = Field(default=0.5, gt=0, description="longest side [m]")
+    rotation_deg: tuple[float, float, float] = Field(
+        default=(0, 0, 0), description="about the fixed axes x, then y, then z"
+    )
+    position: tuple[float, float] = Field(default=(0, 0), description="x, z of the box's centre [m]")
+    clearance: float = Field(default=0.15, ge=0, description="lowest point above the ground [m]")
 
     @model_validator(mode="after")
     def _mesh_is_given(self) -> ShapeSpec:
@@ -57,7 +61,7 @@ def make_body(spec: ShapeSpec, particle_count: int) -> Solid:
         solid.apply_translation(-middle)
         solid.apply_scale(1 / side)
     lattice, spacing = _fill(solids, particle_count)
-    fine = [trimesh.remesh.subdivide_to_size(s.vertices, s.faces, 1 / _FACETS_ALONG, max_iter=20) for s in solids]
+    fine = [_subdivided(solid) for solid in solids]
     local = np.concatenate([vertices for vertices, _ in fine])
     offsets = np.cumsum([0, *(len(vertices) for vertices, _ in fine[:-1])])
     faces = np.concatenate([f + offset for (_, f), offset in zip(fine, offsets, strict=True)])
@@ -67,6 +71,11 @@ def make_body(spec: ShapeSpec, particle_count: int) -> Solid:
     shift = np.array([spec.position[0], spec.clearance, spec.position[1]])
     shift -= [(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2]
     return Solid(vertices + shift, faces, particles + shift, len(lattice) * (spacing * spec.size) ** 3, local)
+
+
+def _subdivided(solid: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    divided = trimesh.remesh.subdivide_to_size(solid.vertices, solid.faces, 1 / _FACETS_ALONG, max_iter=20)
+    return divided[0], divided[1]
 
 
 def _solids(spec: ShapeSpec) -> list[trimesh.Trimesh]:
@@ -85,6 +94,7 @@ def _solids(spec: ShapeSpec) -> list[trimesh.Trimesh]:
             return [creation.torus(major_radius=0.34, minor_radius=0.16, major_sections=64, minor_sections=32)]
         case "cross":
             return [creation.box(np.where(np.arange(3) == axis, 1.0, 0.36)) for axis in range(3)]
+    assert spec.mesh is not None
     mesh = read_mesh(spec.mesh)
     if mesh.volume < 0:
         mesh.invert()

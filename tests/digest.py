@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 
 import torch
+from small import NODES, SUBSTEPS
 from test_rasterise import BACKGROUND, make_camera, make_gaussians, weighted
 
 from masiv import runtime
@@ -24,7 +25,7 @@ def simulated() -> list[torch.Tensor]:
     v = torch.randn(COUNT, 3, generator=generator) - torch.tensor([0.0, 2.0, 0.0])
     simulator = Simulator(
         particle_count=COUNT, spacing=0.05, substep=1e-3, volume=0.125, density=1000.0, gravity=(0.0, -9.8, 0.0),
-        max_substeps=64, grid_nodes=1 << 15,
+        max_substeps=SUBSTEPS, grid_nodes=NODES,
     )  # fmt: skip
     law = ClassicalLaw("neo_hookean", youngs_modulus=2e4, poissons_ratio=0.3)
     end = rollout(simulator, law, at_rest(x, v, torch.zeros(COUNT, 3, 3)), STEPS, [STEPS])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from small import NODES, SMALL, SUBSTEPS
 from test_identify import scene
 from test_identify_classical import body, filmed, settings  # noqa: F401
 from test_laws import EXAMPLES, F64, gradients
@@ -13,7 +14,6 @@ from masiv.identify.stage import identify
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.classical import PARAMETERS, ClassicalLaw
 from masiv.materials.load import load_law
-from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulator import Simulator
 from masiv.mpm.state import State
@@ -62,7 +62,7 @@ def test_an_adapter_is_at_rest_isotropic_and_frame_indifferent(kind):
 def test_kernels_of_an_adapter_equal_its_definition_and_its_gradient(kind):
     law, f = adapter(kind, seed=2), gradients(16, 0.05)
     sim = Simulator(particle_count=16, spacing=0.1, substep=1e-3, volume=1.0, density=1.0, gravity=(0, 0, 0), dtype=F64,
-                    max_substeps=64, grid_nodes=1 << 15)  # fmt: skip
+                    max_substeps=SUBSTEPS, grid_nodes=NODES)  # fmt: skip
     zeros = torch.zeros(16, 3, dtype=F64)
     sim.kernels.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
     bound = law.bind(sim.kernels, 16, 1e-3)
@@ -110,13 +110,13 @@ def test_fit_of_an_adapter_improves_on_its_base_and_resumes(body, tmp_path):  # 
     # A body that yields, which no elastic law does.
     seen = filmed(body, ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=2e3))
     config = settings("adapter", adapter_base="neo_hookean", family_rollouts=12, iterations=4, pictures=0)
-    whole = identify(scene(), seen, config, SimulatorConfig())
+    whole = identify(scene(), seen, config, SMALL)
     assert whole.law.kind == "adapter"
     assert whole.fit["trajectory_error_mm"] <= whole.fit["classical_error_mm"] + 0.1
     path = tmp_path / "identify.pt"
     with pytest.raises(Stop):
-        identify(scene(), seen, config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0), progress=stop_late)
-    resumed = identify(scene(), seen, config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0))
+        identify(scene(), seen, config, SMALL, checkpoint=Checkpoint(path, every_s=0), progress=stop_late)
+    resumed = identify(scene(), seen, config, SMALL, checkpoint=Checkpoint(path, every_s=0))
     assert whole.fit == resumed.fit
     for name, value in whole.law.state_dict().items():
         assert torch.equal(value, resumed.law.state_dict()[name])
@@ -130,7 +130,7 @@ def test_gradient_of_a_rollout_with_an_adapter_equals_finite_differences():
                     torch.zeros(64, 3, 3, dtype=F64))  # fmt: skip
     start = State(start.position, start.velocity.expand(64, 3), start.affine_velocity, start.trial_gradient)
     sim = Simulator(particle_count=64, spacing=0.1, substep=1e-3, volume=0.064, density=1000.0, gravity=(0, -9.8, 0),
-                    dtype=F64, max_substeps=64, grid_nodes=1 << 15)  # fmt: skip
+                    dtype=F64, max_substeps=SUBSTEPS, grid_nodes=NODES)  # fmt: skip
 
     def loss():
         return rollout(sim, law, start, 40, [20, 40]).pow(2).sum()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import typer
+import yaml
 
 import masiv
 from masiv.cli.main import app
@@ -137,3 +138,9 @@ def test_architecture_has_the_layers_that_are_checked():
     table = re.findall(r"`(\w+)`", text.partition("## Layers")[2].partition("\n## ")[0])
     assert len(layers) > 20
     assert set(layers) <= set(table)
+
+
+def test_version_is_the_same_everywhere():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == masiv.__version__
+    assert f"\n## {masiv.__version__} " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

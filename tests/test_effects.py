@@ -6,6 +6,7 @@ import sys
 
 import pytest
 import torch
+from small import NODES, SUBSTEPS
 
 import masiv.effects
 from masiv.effects.active import ActiveEffects
@@ -35,9 +36,9 @@ def setting(x):
 
 
 def simulator(count, contact="sticky", gravity=(0, -9.8, 0), friction=0.3, dtype=F64):
-    """One capacity everywhere: one compile."""
     return Simulator(particle_count=count, spacing=0.05, substep=DT, volume=0.2**3, density=1e3, gravity=gravity,
-                     contact=contact, friction=friction, dtype=dtype, max_substeps=64, grid_nodes=1 << 14)  # fmt: skip
+                     contact=contact, friction=friction, dtype=dtype, max_substeps=SUBSTEPS,
+                     grid_nodes=NODES)  # fmt: skip
 
 
 def thrown_body(x):

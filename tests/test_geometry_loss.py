@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from small import SMALL
 from test_identify import body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.identify.losses.geometry import chamfer_error, surface_points, trajectory_error
 from masiv.identify.stage import identify
-from masiv.mpm.config import SimulatorConfig
 
 
 def lattice(side=7):
@@ -39,6 +39,6 @@ def test_the_surface_of_a_cube_is_its_outer_layer():
 
 @pytest.mark.parametrize("loss", ["continuum", "surface"])
 def test_a_fit_to_sets_of_points_ends_near_the_motion(seen, loss):  # noqa: F811
-    twin = identify(scene(), seen[0], settings(geometry_loss=loss, iterations=6), SimulatorConfig())
+    twin = identify(scene(), seen[0], settings(geometry_loss=loss, iterations=6), SMALL)
     assert twin.fit["geometry_loss"] == loss
     assert twin.fit["trajectory_error_mm"] < 30

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from small import SMALL
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
@@ -23,7 +24,6 @@ from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, estimate_initial_motion
-from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.simulate import simulate
@@ -73,7 +73,7 @@ def seen(taichi, body):
     law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
     truth = Twin.of_body(
         positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
-        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(split=1),
+        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SMALL,
     )  # fmt: skip
     motion = simulate(truth, frames=FRAMES + 4)
     return Seen(motion.positions[:FRAMES], motion.times[:FRAMES], 0.064), motion.positions
@@ -129,7 +129,7 @@ def test_an_inelastic_starting_law_must_be_nearer_by_a_margin():
 
 def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
     trajectory, positions = seen
-    twin = identify(scene(), trajectory, settings(), SimulatorConfig())
+    twin = identify(scene(), trajectory, settings(), SMALL)
     predicted = merge_subparticles(simulate(twin, frames=FRAMES + 4).positions, positions.shape[1])
     error = np.linalg.norm(predicted - positions, axis=2).mean(1)
     rigid = np.linalg.norm(positions[-1] - positions[0] - (positions[-1] - positions[0]).mean(0), axis=1).mean()
@@ -139,9 +139,7 @@ def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
 
 
 def test_no_starting_law_is_stiffer_than_a_motion_determines(seen):
-    problem = FilmedBody(
-        scene(), seen[0], SimulatorConfig(), samples=2, chosen=np.arange(0, len(seen[0].positions[0]), 4)
-    )
+    problem = FilmedBody(scene(), seen[0], SMALL, samples=2, chosen=np.arange(0, len(seen[0].positions[0]), 4))
     motion = InitialState.of_world(problem.axes, VELOCITY, OMEGA)
     errors = [
         objective_of_start(Objective(problem, settings()), motion, "jelly", "sticky", factor * MAX_START_MODULUS)
@@ -160,13 +158,13 @@ def test_interrupted_identify_ends_with_the_same_numbers(seen, tmp_path):
             raise Stop
 
     config = settings(iterations=5)
-    whole = identify(scene(), seen[0], config, SimulatorConfig())
+    whole = identify(scene(), seen[0], config, SMALL)
     path = tmp_path / "identify.pt"
     with pytest.raises(Stop):
-        identify(scene(), seen[0], config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0),
+        identify(scene(), seen[0], config, SMALL, checkpoint=Checkpoint(path, every_s=0),
                  progress=stop_at_iteration_3)  # fmt: skip
     assert path.exists()
-    resumed = identify(scene(), seen[0], config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0))
+    resumed = identify(scene(), seen[0], config, SMALL, checkpoint=Checkpoint(path, every_s=0))
     assert np.array_equal(whole.velocity, resumed.velocity)
     assert whole.ground.height == resumed.ground.height
     for name, value in whole.law.state_dict().items():
@@ -175,7 +173,7 @@ def test_interrupted_identify_ends_with_the_same_numbers(seen, tmp_path):
 
 
 def test_twin_survives_saving(seen, tmp_path):
-    twin = identify(scene(), seen[0], settings(iterations=1), SimulatorConfig())
+    twin = identify(scene(), seen[0], settings(iterations=1), SMALL)
     twin.save(tmp_path)
     again = Twin.load(tmp_path)
     assert np.array_equal(simulate(twin, frames=4).positions, simulate(again, frames=4).positions)

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from small import SMALL
 from test_identify import FPS, FRAMES, GRAVITY, GROUND, OMEGA, UP, VELOCITY, Seen, scene
 
 from masiv.checkpoint import Checkpoint
@@ -17,7 +18,6 @@ from masiv.inference.noise_model import effective_samples
 from masiv.materials.classical import ClassicalLaw
 from masiv.models import families
 from masiv.models.families import FAMILIES, law_of
-from masiv.mpm.config import SimulatorConfig
 from masiv.simulation.simulate import simulate
 from masiv.twin import Twin
 
@@ -32,7 +32,7 @@ def body():
 def filmed(body, law):
     truth = Twin.of_body(
         positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
-        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(split=1),
+        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SMALL,
     )  # fmt: skip
     motion = simulate(truth, frames=FRAMES)
     noise = np.random.default_rng(0).normal(0, 1e-3, motion.positions.shape).astype(np.float32)
@@ -59,7 +59,7 @@ TRUTHS = {
 @pytest.mark.parametrize("kind", list(TRUTHS))
 def test_parameters_are_recovered_with_errors_that_cover_them(body, kind):
     truth, tolerance = TRUTHS[kind]
-    twin = identify(scene(), filmed(body, ClassicalLaw(kind, **truth)), settings(kind), SimulatorConfig())
+    twin = identify(scene(), filmed(body, ClassicalLaw(kind, **truth)), settings(kind), SMALL)
     described = twin.law.description()
     assert described["kind"] == kind
     assert twin.fit["trajectory_error_mm"] < 4
@@ -84,14 +84,14 @@ def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(body, tmp_path):
 
     seen = filmed(body, ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3))
     config = settings("neo_hookean", family_rollouts=14)
-    whole = identify(scene(), seen, config, SimulatorConfig())
+    whole = identify(scene(), seen, config, SMALL)
     path = tmp_path / "identify.pt"
     with pytest.raises(Stop):
-        identify(scene(), seen, config, SimulatorConfig(), checkpoint=Checkpoint(path),
+        identify(scene(), seen, config, SMALL, checkpoint=Checkpoint(path),
                  progress=stop_in_the_second_stage)  # fmt: skip
     stages.clear()
     resumed = identify(
-        scene(), seen, config, SimulatorConfig(), checkpoint=Checkpoint(path),
+        scene(), seen, config, SMALL, checkpoint=Checkpoint(path),
         progress=lambda stage, *_: stages.append(stage),
     )  # fmt: skip
     assert not any("search" in stage for stage in stages)
@@ -105,7 +105,7 @@ def test_auto_names_the_family_that_moved_so(body, monkeypatch):
     coarse = {kind: dataclasses.replace(FAMILIES[kind], search={}) for kind in ("newtonian", "neo_hookean")}
     monkeypatch.setattr(shortlist, "FAMILIES", coarse)
     seen = filmed(body, ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3))
-    twin = identify(scene(), seen, settings("auto", family_rollouts=24), SimulatorConfig())
+    twin = identify(scene(), seen, settings("auto", family_rollouts=24), SMALL)
     assert twin.fit["law"] == twin.law.kind == "neo_hookean"
     rows = twin.fit["families"]
     assert [row["law"] for row in rows] == ["neo_hookean", "newtonian"]

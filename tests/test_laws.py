@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from small import NODES, SUBSTEPS
 
 from masiv.errors import InputError
 from masiv.kernels.lattice import LATTICE_COUNTS, LATTICE_STEP
@@ -150,7 +151,7 @@ def test_kernels_equal_the_definition(name):
     law = rough(3) if name == "neural" else ClassicalLaw(name, **EXAMPLES[name])
     f = gradients(64, 0.1)
     sim = Simulator(particle_count=64, spacing=0.1, substep=1e-3, volume=1.0, density=1.0, gravity=(0, 0, 0), dtype=F64,
-                    max_substeps=64, grid_nodes=1 << 15)  # fmt: skip
+                    max_substeps=SUBSTEPS, grid_nodes=NODES)  # fmt: skip
     zeros = torch.zeros(64, 3, dtype=F64)
     sim.kernels.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
     law.bind(sim.kernels, 64, 1e-3).forward(0, 64)
@@ -274,7 +275,7 @@ def test_classical_laws_are_at_rest_when_undeformed_and_do_not_see_rotations(kin
 def test_adjoint_of_a_classical_law_equals_autograd(kind):
     law, f = ClassicalLaw(kind, **EXAMPLES[kind]), gradients(8, 0.05)
     sim = Simulator(particle_count=8, spacing=0.1, substep=1e-3, volume=1.0, density=1.0, gravity=(0, 0, 0), dtype=F64,
-                    max_substeps=64, grid_nodes=1 << 15)  # fmt: skip
+                    max_substeps=SUBSTEPS, grid_nodes=NODES)  # fmt: skip
     zeros = torch.zeros(8, 3, dtype=F64)
     sim.kernels.write_state(0, *State(*at_rest(zeros, zeros, torch.zeros_like(f)).tensors()[:3], f).tensors())
     bound = law.bind(sim.kernels, 8, 1e-3)

@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from masiv.characterization import curves
-from masiv.characterization.describe import Quantity, describe, describe_twin, paragraph, said
+from masiv.characterization.describe import Quantity, describe, describe_twin, formatted, paragraph
 from masiv.characterization.excitation import Excited, excited_range, perturbed, sensitivities
 from masiv.errors import InputError, NonFiniteError
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.mpm.rollout import at_rest
 from masiv.pretraining.pretrain import MATERIALS, pretrained_path
-from masiv.report.material import material_section, read_material
 from masiv.report.page import Page
+from masiv.report.sections.material import material_section, read_material
 
 SEEN = Excited((0.0005, 0.03), (0.001, 0.3), (-0.01, 0.005), 5.0)
 
@@ -263,7 +263,7 @@ def test_a_twin_is_described_with_errors_saved_and_reported(taichi, tmp_path):
 
 
 def test_quantities_are_said_with_fitting_units():
-    assert said(Quantity(12345.0, "Pa", stderr_percent=14.2)) == "12.3 kPa ± 14 %"
-    assert said(Quantity(2e6, "Pa", "under pressure")) == "2 MPa (under pressure)"
-    assert said(Quantity(None, "Pa")) == "none"
-    assert said(Quantity(0.3, "", stderr_percent=250.0)) == "0.3 ± more than 100 %"
+    assert formatted(Quantity(12345.0, "Pa", stderr_percent=14.2)) == "12.3 kPa ± 14 %"
+    assert formatted(Quantity(2e6, "Pa", "under pressure")) == "2 MPa (under pressure)"
+    assert formatted(Quantity(None, "Pa")) == "none"
+    assert formatted(Quantity(0.3, "", stderr_percent=250.0)) == "0.3 ± more than 100 %"

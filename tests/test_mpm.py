@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from small import NODES, SUBSTEPS
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.bound import BoundEffects
@@ -32,7 +33,7 @@ def elastic(stiffness=2e4):
 def simulator(count, **changes):
     settings = dict(
         spacing=0.1, substep=2e-3, volume=0.027, density=1000.0, gravity=(0.0, -9.8, 0.0), dtype=F64,
-        max_substeps=64, grid_nodes=1 << 15,
+        max_substeps=SUBSTEPS, grid_nodes=NODES,
     )  # fmt: skip
     return Simulator(particle_count=count, **(settings | changes))
 
@@ -85,7 +86,7 @@ def test_bar_rings_at_its_natural_frequency():
     law = ClassicalLaw("neo_hookean", youngs_modulus=stiffness, poissons_ratio=0.0)
     dt, steps = 5e-4, 600
     sim = simulator(len(x), spacing=spacing, substep=dt, volume=length * width**2, gravity=(0.0, 0.0, 0.0),
-                    contact="none", max_substeps=64)  # fmt: skip
+                    contact="none", max_substeps=SUBSTEPS)  # fmt: skip
     affine = torch.zeros(len(x), 3, 3, dtype=F64)
     affine[:, 0, 0] = -0.01 * math.pi / length * torch.sin(math.pi * x[:, 0] / length)
     motion = sim.run(at_rest(x, velocity, affine), law, steps, list(range(steps + 1))).positions
@@ -160,6 +161,7 @@ def test_the_adjoint_of_a_yielding_body_does_not_grow():
     law = load_law(pretrained_path("plasticine"))
     sim = Simulator(
         particle_count=343, spacing=0.08, substep=6e-4, volume=0.064, density=1000.0, gravity=(0.0, -9.8, 0.0),
+        max_substeps=SUBSTEPS, grid_nodes=NODES,
     )  # fmt: skip
     axis = 0.4 * (torch.arange(7) + 0.5) / 7
     x = torch.stack(torch.meshgrid(axis, axis + 0.05, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -174,14 +176,14 @@ def test_the_adjoint_of_a_yielding_body_does_not_grow():
 def test_rollout_is_bit_reproducible_and_segments_do_not_change_it():
     law = elastic()
     start = State(*(t.float() for t in blob(200, height=0.05).tensors()))
-    roomy = simulator(200, dtype=torch.float32, max_substeps=128)
+    roomy = simulator(200, dtype=torch.float32)
     tight = simulator(200, dtype=torch.float32, memory_mb=7)  # a few dozen states at most
-    assert tight.kernels.capacity_steps < 100 <= roomy.kernels.capacity_steps
+    assert tight.kernels.capacity_steps < 50 <= roomy.kernels.capacity_steps
 
     def run(sim):
         x = start.position.clone().requires_grad_()
         state = State(x, start.velocity, start.affine_velocity, start.trial_gradient)
-        end = rollout(sim, law, state, 100, [30, 100])
+        end = rollout(sim, law, state, 50, [30, 50])
         return end.detach(), torch.autograd.grad(end.square().sum(), [x, *law.parameters()])
 
     first, second, segmented = run(roomy), run(roomy), run(tight)

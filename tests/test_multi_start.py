@@ -1,6 +1,7 @@
 """Two starts that few particles cannot distinguish: both are fitted, the better fit is kept."""
 
 import pytest
+from small import SMALL
 from test_identify import body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.checkpoint import Checkpoint
@@ -13,7 +14,6 @@ from masiv.identify.recording import FitRecording
 from masiv.materials.neural import NeuralLaw
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
-from masiv.mpm.config import SimulatorConfig
 from masiv.progress import silent
 
 
@@ -23,7 +23,7 @@ def fit(seen, monkeypatch, errors, objectives, image_losses=None):  # noqa: F811
     fitted, laws = [], {name: NeuralLaw(seed=k) for k, name in enumerate(errors)}
     changes = {"surface_finetune": image_losses is not None, "pictures": 1}
     config = settings(**changes)
-    problem = FilmedBody(scene(), seen[0], SimulatorConfig(), samples=config.samples_per_frame)
+    problem = FilmedBody(scene(), seen[0], SMALL, samples=config.samples_per_frame)
     objective = Objective(problem, config)
     monkeypatch.setattr(Objective, "has_surface_finetune", image_losses is not None)
 

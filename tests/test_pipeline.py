@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from small import SMALL
 
 SPEC = {
     "shape": {"kind": "cube", "size": 0.4, "rotation_deg": [20, 30, 0], "clearance": 0.25},
@@ -22,6 +23,7 @@ SPEC = {
     "truth_particles": 500,
 }
 TINY = {
+    "simulator": SMALL.model_dump(exclude_defaults=True),
     "reconstruct": {"gaussians": 250, "hull_resolution": 24, "iterations": 120, "width": 16, "depth": 1},
     "trajectory": {"particle_count": 300, "fill_resolution": 24, "iterations": 20},
     "identify": {"start": "jelly", "contact": "sticky", "search_particles": 150, "iterations": 4},

@@ -59,6 +59,14 @@ def test_a_dry_run_leaves_an_earlier_result_alone(run):
     assert json.loads((run.path / "refine.dry_run.json").read_text())["candidates"]
 
 
+@pytest.mark.parametrize("condition", ["dry_run", "load.dry_run", ".", "..", "../x", "wind/2", "CON", "a:b"])
+def test_no_condition_has_the_file_of_a_dry_run_or_leaves_the_folder(condition):
+    stem = refine_stem(condition, "")
+    assert stem not in {f"{refine_stem(other, '')}.dry_run" for other in ("", "load", condition)}
+    assert not set(stem) & set('/\\:*?"<>|')
+    assert stem.count(".") == 1
+
+
 @given(st.text(min_size=1), st.text(min_size=1))
 def test_a_condition_names_one_file_inside_the_run_folder(one, other):
     stems = [refine_stem(condition, "first condition") for condition in (one, other)]

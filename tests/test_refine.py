@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small import NODES, SMALL, SUBSTEPS
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
@@ -18,7 +19,6 @@ from masiv.inference.least_squares import clipped_step
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.initial_state import rigid_initial_state
 from masiv.models.parameters import Parameter
-from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
@@ -52,7 +52,8 @@ def observed(effects, noise_m=3e-4, velocity=VELOCITY, omega=OMEGA):
     start = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.0, 0.45, 0.0])
     steps = 48
     simulator = Simulator(particle_count=COUNT, spacing=(6 * SIDE**3 / COUNT) ** (1 / 3), substep=1 / (FPS * steps),
-                          volume=SIDE**3, density=1000.0, gravity=(0.0, -9.8, 0.0), max_substeps=512)  # fmt: skip
+                          volume=SIDE**3, density=1000.0, gravity=(0.0, -9.8, 0.0),
+                          max_substeps=SUBSTEPS, grid_nodes=NODES)  # fmt: skip
     setting = EffectContext(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * SIDE**3 / COUNT, SIDE, FRAMES / FPS)
     members = tuple((effect_named(name), torch.tensor(values)) for name, values in effects.items())
     law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
@@ -76,9 +77,7 @@ def found(*motions, **settings):
               SampledMotion(m.positions[:FITTED], m.times[:FITTED], m.volume), m, FITTED)
         for k, m in enumerate(motions)
     ]  # fmt: skip
-    refined = refine_recordings(
-        recordings, IdentifyConfig.model_validate({"contact": "sticky"}), SimulatorConfig.model_validate({}), config
-    )
+    refined = refine_recordings(recordings, IdentifyConfig.model_validate({"contact": "sticky"}), SMALL, config)
     return refined, document_of(refined)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from small import SMALL
 from test_identify import (  # noqa: F401  (fixtures)
     FPS,
     FRAMES,
@@ -30,7 +31,6 @@ from masiv.identify.recording import prepare_recording
 from masiv.identify.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
-from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.simulation.simulate import simulate
 from masiv.twin import Twin
@@ -45,7 +45,7 @@ def dropped(taichi, body):  # noqa: F811
     truth = Twin.of_body(
         positions=body, velocity=DROP, omega=-OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
         volume=0.064, density=1000.0, up=UP, fps=FPS,
-        law=ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3), simulator=SimulatorConfig(split=1),
+        law=ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3), simulator=SMALL,
     )  # fmt: skip
     motion = simulate(truth, frames=FRAMES - 1)  # one frame fewer: films differ in length
     return Seen(motion.positions, motion.times, 0.064)
@@ -54,7 +54,7 @@ def dropped(taichi, body):  # noqa: F811
 def recordings_of(seen, dropped, config):  # noqa: F811
     shorter = dataclasses.replace(scene(), frame_count=FRAMES - 1)
     films = (scene(), seen[0]), (shorter, dropped)
-    return [prepare_recording(*film, config, SimulatorConfig())[0] for film in films]
+    return [prepare_recording(*film, config, SMALL)[0] for film in films]
 
 
 def stiffer(factor):
@@ -117,17 +117,17 @@ def test_a_stage_that_is_killed_goes_on_with_all_recordings(seen, dropped, tmp_p
 
     config = settings(iterations=3)
     more = {"others": [(dataclasses.replace(scene(), frame_count=FRAMES - 1), dropped)]}
-    whole = identify(scene(), seen[0], config, SimulatorConfig(), **more)
+    whole = identify(scene(), seen[0], config, SMALL, **more)
     assert whole.fit["recordings"] == 2
     path = tmp_path / "identify.pt"
     with pytest.raises(Stop):
-        identify(scene(), seen[0], config, SimulatorConfig(), **more, checkpoint=Checkpoint(path, every_s=0),
+        identify(scene(), seen[0], config, SMALL, **more, checkpoint=Checkpoint(path, every_s=0),
                  progress=stops)  # fmt: skip
-    resumed = identify(scene(), seen[0], config, SimulatorConfig(), **more, checkpoint=Checkpoint(path, every_s=0))
+    resumed = identify(scene(), seen[0], config, SMALL, **more, checkpoint=Checkpoint(path, every_s=0))
     assert resumed.fit == whole.fit
     assert all(torch.equal(a, b) for a, b in zip(whole.law.parameters(), resumed.law.parameters(), strict=True))
     with pytest.raises(InputError, match="fitted to one recording"):
-        identify(scene(), seen[0], settings(law="neo_hookean"), SimulatorConfig(), **more)
+        identify(scene(), seen[0], settings(law="neo_hookean"), SMALL, **more)
 
 
 def test_other_recordings_are_checked_before_anything_is_made(tmp_path, capsys, monkeypatch):

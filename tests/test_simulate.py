@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from small import NODES, SMALL, SUBSTEPS
 
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.blend import BlendedLaw, blend
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import strain_invariants
-from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.simulator import Simulator
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.report.film import balls
@@ -37,7 +37,7 @@ def twin(law=None, up=(0.0, 1.0, 0.0), **changes):
         positions=cube.astype(np.float32), velocity=np.array([0.4, 0.5, 0.0]), omega=np.zeros(3), gravity=GRAVITY,
         ground=Ground(up, 0.0), contact="sticky", friction=0.0, volume=SIDE**3, density=1000.0, up=up, fps=FPS,
         law=law or ClassicalLaw("neo_hookean", youngs_modulus=2e4, poissons_ratio=0.3),
-        simulator=SimulatorConfig(grid_nodes=1 << 15, memory_mb=200),
+        simulator=SMALL,
     )  # fmt: skip
     return Twin.of_body(**(settings | changes))
 
@@ -174,8 +174,8 @@ def test_a_blend_rolls_out_as_its_definition_and_between_its_ends():
 
 def simulator():
     return Simulator(
-        particle_count=216, spacing=0.1, substep=1e-3, volume=0.027, density=1e3, gravity=GRAVITY, memory_mb=200,
-        max_substeps=64, grid_nodes=1 << 15,
+        particle_count=216, spacing=0.1, substep=1e-3, volume=0.027, density=1e3, gravity=GRAVITY,
+        max_substeps=SUBSTEPS, grid_nodes=NODES,
     )  # fmt: skip
 
 
@@ -192,7 +192,7 @@ def test_classical_laws_of_one_kind_blend_their_parameters():
 def test_a_mesh_keeps_mass_size_and_place(tmp_path):
     path = tmp_path / "ball.obj"
     trimesh.creation.icosphere(subdivisions=3, radius=40.0).export(path)  # in millimetres, say
-    body = twin(up=(0.0, 0.0, 1.0))
+    body = twin(up=(0.0, 0.0, 1.0), simulator=SMALL.model_copy(update={"subparticles": 4}))
     ball = with_density(with_mesh(body, path), 700.0)
     true = np.pi / 6 * np.ptp(body.positions, axis=0).max() ** 3  # a ball as wide as the cube's outer points
     assert ball.volume == pytest.approx(true, rel=0.03)

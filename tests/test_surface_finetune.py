@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from ring_scene import look_at
+from small import SMALL
 from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.checkpoint import Checkpoint
@@ -19,7 +20,6 @@ from masiv.identify.stage import identify
 from masiv.materials.load import load_law
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
-from masiv.mpm.config import SimulatorConfig
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Frame
 from masiv.splat.rasteriser import render
@@ -50,7 +50,7 @@ def filmed(seen):  # noqa: F811
 
 def objective_of(filmed, seen, **changes):  # noqa: F811
     config = settings(**{"pictures": 4, "iterations": 16, **changes})
-    problem = FilmedBody(filmed, seen[0], SimulatorConfig(), samples=config.samples_per_frame)
+    problem = FilmedBody(filmed, seen[0], SMALL, samples=config.samples_per_frame)
     return Objective(problem, config)
 
 
@@ -133,7 +133,7 @@ def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers
         pass
 
     config = settings(iterations=4, pictures=1)
-    whole = identify(filmed, seen[0], config, SimulatorConfig())
+    whole = identify(filmed, seen[0], config, SMALL)
     assert whole.fit["silhouette_error_of_surfaces"] > 0
     assert [row["iteration"] for row in whole.fit["history"]] in ([0, 1, 2, 3, 4, 5], [0, 1, 2, 3])
 
@@ -143,8 +143,8 @@ def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers
 
     path = tmp_path / "identify.pt"
     with pytest.raises(Stop):
-        identify(filmed, seen[0], config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0), progress=stops)
-    resumed = identify(filmed, seen[0], config, SimulatorConfig(), checkpoint=Checkpoint(path, every_s=0))
+        identify(filmed, seen[0], config, SMALL, checkpoint=Checkpoint(path, every_s=0), progress=stops)
+    resumed = identify(filmed, seen[0], config, SMALL, checkpoint=Checkpoint(path, every_s=0))
     assert whole.fit == resumed.fit
     for name, value in whole.law.state_dict().items():
         assert torch.equal(value, resumed.law.state_dict()[name])

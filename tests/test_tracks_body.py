@@ -11,13 +11,13 @@ import pytest
 import torch
 import trimesh
 import yaml
+from small import SMALL
 
 from masiv.effects.catalogue import effects
 from masiv.errors import MasivError
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.attachment import attach
 from masiv.models.marked_body import marked_body
-from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest
 from masiv.tracks.declaration import GeometryDeclaration
 from masiv.tracks.geometry import fill_geometry, make_geometry
@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 from dissipation import bar, cantilever_hz, swing
 
 F64 = torch.float64
-CONFIG = SimulatorConfig(particles_per_cell=8, courant_number=0.5, max_substeps_per_frame=1000)
+CONFIG = SMALL.model_copy(update={"particles_per_cell": 8, "courant_number": 0.5, "max_substeps_per_frame": 1000})
 
 
 def lattice(spacing=0.1, count=6):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from small import SMALL
 from test_tracks_group import Ball, write_scene
 
 from masiv.cli import main
@@ -24,7 +25,6 @@ from masiv.models.clamped_body import ClampedBodyModel
 from masiv.models.families import family_of
 from masiv.models.marked_body import marked_body
 from masiv.models.release import clamp_axes, static_deflection
-from masiv.mpm.config import SimulatorConfig
 from masiv.refine.candidates import score
 from masiv.refine.config import RefineConfig
 from masiv.refine.effect_fit import fit_with_effect
@@ -36,7 +36,7 @@ from masiv.tracks.read import read_tracks
 pytestmark = pytest.mark.usefixtures("taichi")
 YOUNGS, RATIO, VISCOSITY, LOAD = 2e5, 0.2, 150.0, 0.04
 PARTICLES, DURATION, RATE = 64, 0.22, 100.0
-SIMULATOR = SimulatorConfig(courant_number=0.6, max_substeps_per_frame=4000)
+SIMULATOR = SMALL.model_copy(update={"courant_number": 0.6, "max_substeps_per_frame": 4000})
 TRACKS = TracksConfig(particles=PARTICLES, duration=DURATION, rollouts=12)
 NOISE = 2e-5
 

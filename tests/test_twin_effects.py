@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from small import NODES, SMALL, SUBSTEPS
 from tiny_scenes import springgaus_synthetic
 
 from masiv.cli import main
@@ -21,12 +22,11 @@ from masiv.errors import InputError
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, rigid_initial_state
-from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.simulator import Simulator
 from masiv.pipeline import Overrides, open_run
 from masiv.report.page import Page
-from masiv.report.report import _effects_section
+from masiv.report.sections.twin import effects_table
 from masiv.runfolder import STAGES
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.force import ForcePulse
@@ -41,7 +41,7 @@ SIDE, FPS = 0.3, 24.0
 UP = np.array([0.0, 1.0, 0.0])
 GRAVITY = -9.8 * UP
 LAW = ClassicalLaw("neo_hookean", youngs_modulus=2e4, poissons_ratio=0.3)
-CONFIG = SimulatorConfig(split=1, grid_nodes=1 << 15, memory_mb=200)
+CONFIG = SMALL
 DRAG = TwinEffect("linear_drag", {"rate": 3.0}, {"rate": 0.1})
 LATE = TwinEffect("time_offset", {"delay": 0.011})
 HIGH = TwinEffect("ground_height", {"height": 0.07})
@@ -78,8 +78,8 @@ def test_without_effects_every_bit_is_that_of_bare_rollouts():
         steps = substeps_per_frame(spacing=spacing, wave_modulus=LAW.wave_modulus(), density=1e3, speed=speed,
                                    frame_time=1 / FPS, config=CONFIG)  # fmt: skip
         simulator = Simulator(particle_count=len(body.positions), spacing=spacing, substep=1 / FPS / steps,
-                              volume=body.volume, density=1e3, gravity=GRAVITY, memory_mb=200, max_substeps=64,
-                              grid_nodes=1 << 15)  # fmt: skip
+                              volume=body.volume, density=1e3, gravity=GRAVITY, max_substeps=SUBSTEPS,
+                              grid_nodes=NODES)  # fmt: skip
         state = simulator.run(state, LAW, steps, []).final
         bare.append(state.position)
     np.testing.assert_array_equal(simulate(body, frames=frames).positions, torch.stack(bare).numpy())
@@ -306,9 +306,9 @@ def test_the_command_leaves_effects_out(tmp_path, monkeypatch, capfd):
 
 def test_the_report_lists_effects(tmp_path):
     page = Page("twin")
-    _effects_section(page, twin())
+    effects_table(page, twin())
     assert page.parts == []
-    _effects_section(page, twin(DRAG, LATE))
+    effects_table(page, twin(DRAG, LATE))
     text = "".join(page.parts)
     for part in ("linear drag", "rate", "3", "1/s", "0.1", "delay", "0.011", "–"):
         assert f">{part}<" in text

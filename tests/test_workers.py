@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from small import SMALL
 from test_refine import FITTED, OMEGA, VELOCITY, observed, scene
 
 from masiv import runtime
@@ -25,7 +26,6 @@ from masiv.models.families import FAMILIES
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import InitialState
-from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import ALL_FRAMES_STAGE, baselines, differentiated
 from masiv.refine.config import RefineConfig
@@ -220,7 +220,7 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
     motion = observed({})
     motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
-    problem = FilmedBody(scene(), motion, SimulatorConfig(), chosen=np.arange(0, 512, 4))
+    problem = FilmedBody(scene(), motion, SMALL, chosen=np.arange(0, 512, 4))
     objective = Objective(problem, config)
     throw = InitialState.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
     listening = Listening()
@@ -239,7 +239,7 @@ def small_simulation():
     first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
     config = RefineConfig(particles=200, samples_per_frame=1, laws=["neo_hookean"])
     contact = IdentifyConfig(contact="sticky")
-    setup, *_ = prepare("run", scene(), first, motion, contact, SimulatorConfig(), config)
+    setup, *_ = prepare("run", scene(), first, motion, contact, SMALL, config)
     return FreeBodyModel([setup]), config
 
 

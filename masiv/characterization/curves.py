@@ -1,7 +1,7 @@
-"""What a material tester would measure of a law: stress along prescribed deformations, flow included.
+"""Stress of a law along prescribed deformations, flow included, as a material tester would measure it.
 
-All of it in float64, one material point, driven by increments of the deformation gradient: F <- project(dF F, dt), then
-the stress, as a particle of the simulator does. Stresses are Kirchhoff [Pa], strains logarithmic.
+One material point in float64, driven by increments of the deformation gradient as a particle of the simulator is:
+F <- project(dF F, dt), then the stress. Stresses are Kirchhoff [Pa], strains logarithmic.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import torch
 
 from masiv.materials.law import Law
 
-SMALL = 1e-5
-"""Strain of the finite differences at rest."""
+DIFFERENCE_STRAIN = 1e-5
+"""Strain [1] of the finite differences at rest."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,10 @@ def in_float64(law: Law) -> Law:
 def moduli_at_rest(law: Law) -> tuple[float, float]:
     """Shear and bulk modulus [Pa] of the stress at F = I, nothing flowing: 2 G = d tau_dev / d eps, K = dp / d ln J."""
     law = in_float64(law)
-    strain = torch.tensor([[SMALL, -SMALL, 0.0], [SMALL, SMALL, SMALL]], dtype=torch.float64)
+    strain = DIFFERENCE_STRAIN * torch.tensor([[1.0, -1.0, 0.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
     with torch.no_grad():
         forth, back = (law.stress(torch.diag_embed(torch.exp(sign * strain))) for sign in (1, -1))
-    slope = (forth - back) / (2 * SMALL)
+    slope = (forth - back) / (2 * DIFFERENCE_STRAIN)
     return float(slope[0, 0, 0] - slope[0, 1, 1]) / 4, float(slope[1].trace()) / 9
 
 
@@ -104,7 +104,7 @@ def _free_sides(law: Law, state: torch.Tensor, step: float, dt: float) -> tuple[
     """The state (1, 3, 3) and stress (3, 3) after an axial strain ``step`` whose side stress is zero.
 
     Regula falsi (Illinois). Without a change of sign, as of a heap that carries nothing sideways, the side is let go
-    where its stress is least.
+    at its least stress.
     """
 
     def tried(side: float) -> tuple[float, torch.Tensor, torch.Tensor]:

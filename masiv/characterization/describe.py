@@ -1,4 +1,4 @@
-"""What is this material? A law in the terms of a material tester, over the strains that a motion really excited."""
+"""A law in the terms of a material tester, over the strains that an observed motion excited."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ from masiv.subsample import kd_tree_subset
 if TYPE_CHECKING:
     from masiv.twin import Twin
 
-POINTS = 80
-OFFSET = 2e-3
-"""Permanent strain at which a material is said to yield."""
-RATE_DEPENDENT = 0.05
-"""Exponent of the flow stress over the rate from which flow counts as viscous."""
-SMALLEST, LARGEST = 0.02, 0.5
-"""Strains at which a law is tested are at least and at most this."""
-WIDER = 1.5
-"""Curves are drawn so much further than the strains that were observed."""
-STRONG, GRANULAR, FLUID = "solid", "granular", "fluid"
+LOADING_STEPS = 80
+"""Increments of a loading."""
+YIELD_OFFSET = 2e-3
+"""Permanent strain [1] at which a material is said to yield."""
+MIN_RATE_EXPONENT = 0.05
+"""Exponent [1] of the flow stress over the rate from which flow counts as viscous."""
+MIN_TEST_STRAIN, MAX_TEST_STRAIN = 0.02, 0.5
+"""Bounds [1] of the strain at which a law is tested."""
+DRAWN_RANGE = 1.5
+"""Range of the curves, over that of the observed strains."""
+SOLID, GRANULAR, FLUID = "solid", "granular", "fluid"
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A value in ``unit`` (None: there is none, ``note`` says why) and its standard error in percent, where known."""
+    """A value in ``unit`` and its standard error in percent, if known. value None: there is none, ``note`` says why."""
 
     value: float | None
     unit: str
@@ -44,8 +45,10 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Material:
-    """The answer. behaviour: in words. quantities: by name. families: nearest first. curves: name -> strain, stress_pa,
-    family_pa (the nearest family's), observed (low, high)."""
+    """A law in a tester's terms: behaviour in words, quantities by name, families nearest first, and curves.
+
+    error_mm: of the fit [mm]. curves: name -> strain, stress_pa, family_pa (nearest family), observed (low, high).
+    """
 
     behaviour: str
     quantities: dict[str, Quantity]
@@ -66,26 +69,26 @@ class Material:
 
 
 def describe(law: Law, excited: Excited, *, substep: float = 5e-4) -> Material:
-    """``law`` over the range ``excited``, flowing in steps of about ``substep`` [s].
+    """``law`` over the range ``excited``, with increments of about ``substep`` [s].
 
-    Moduli are those of the stress at F = I. Yield is where 0.2 % of an axial strain with free sides is permanent: the
-    0.2 % offset without its assumption that unloading follows the slope at rest, which no large strain does.
+    Moduli are those of the stress at F = I. The yield stress is that at 0.2 % permanent axial strain with free sides.
+    The permanent strain is known, so the usual assumption that unloading follows the initial slope is not needed.
     """
     law = curves.in_float64(law)
-    strain = float(np.clip(excited.strain[1], SMALLEST, LARGEST))
+    strain = float(np.clip(excited.strain[1], MIN_TEST_STRAIN, MAX_TEST_STRAIN))
     log_volume = min(excited.log_volume[0], -2e-3), max(excited.log_volume[1], 2e-3)
-    rate = max(excited.rate, strain / (POINTS * 2 * substep))  # slower loading would flow in too long steps
-    kind = _strength(law, excited, log_volume[0], rate)
+    rate = max(excited.rate, strain / (LOADING_STEPS * 2 * substep))  # slower loading would flow in too long steps
+    kind = _strength_kind(law, excited, log_volume[0], rate)
     shear, bulk = curves.moduli_at_rest(law)
     quantities = _elastic(kind, shear, bulk)
-    dt = strain / (rate * POINTS)
+    dt = strain / (rate * LOADING_STEPS)
     flow, exponent = _flow(law, strain, dt)
     yielding, yields = _yield(law, kind, strain, dt)
     quantities["yield stress"] = yielding
     if kind == GRANULAR:
         quantities["friction angle"] = _friction(law, log_volume[0], strain, dt)
     flows = kind == FLUID or yields
-    if flows and flow > 0 and exponent > RATE_DEPENDENT:
+    if flows and flow > 0 and exponent > MIN_RATE_EXPONENT:
         gamma_rate = math.sqrt(3) * rate
         note = f"apparent, at a shear rate of {gamma_rate:.2g}/s; flow stress ~ rate^{exponent:.2f}"
         quantities["viscosity"] = Quantity(flow / gamma_rate, "Pa s", note)
@@ -94,9 +97,9 @@ def describe(law: Law, excited: Excited, *, substep: float = 5e-4) -> Material:
         note = f"of a shear of {100 * level:.2g} % that is held" + ("" if time else ": none within 10 s")
         quantities["relaxation time"] = Quantity(time, "s", note)
     families = nearest_families(law, strain=strain, log_volume=log_volume, rate=rate)
-    behaviour = _behaviour(kind, yields, flows and exponent > RATE_DEPENDENT)
+    behaviour = _behaviour(kind, yields, flows and exponent > MIN_RATE_EXPONENT)
     made = Material(behaviour, quantities, families, excited)
-    return replace(made, curves=_drawn(law, families[0], excited, strain, log_volume, dt))
+    return replace(made, curves=_curves(law, families[0], excited, strain, log_volume, dt))
 
 
 def describe_twin(
@@ -104,8 +107,8 @@ def describe_twin(
 ) -> Material:
     """``describe`` for the law of ``twin``, with how well ``frames`` frames of its motion determine it.
 
-    trajectory (T, Q, 3) [m]: what it was fitted to, where known; its distance to the rollout tells how many independent
-    data there are. Rollouts are of at most ``particles`` of the twin's.
+    trajectory (T, Q, 3) [m]: what it was fitted to, if known; the residual gives the number of independent data.
+    Rollouts take at most ``particles`` of the twin's particles.
     """
     from masiv import runtime
     from masiv.simulation.free_body import iterate_states
@@ -113,7 +116,8 @@ def describe_twin(
 
     chosen = kd_tree_subset(twin.positions.astype(np.float64), particles)
     coarse = replace(
-        twin.with_body(particles=twin.positions[chosen]), simulator=twin.simulator.model_copy(update={"split": 1})
+        twin.with_body(particles=twin.positions[chosen]),
+        simulator=twin.simulator.model_copy(update={"subparticles": 1}),
     )
     done = 0
 
@@ -135,33 +139,34 @@ def describe_twin(
             error = float(1e3 * np.sqrt((residual**2).sum(2).mean()))
         if error is None:
             return material
-        return determined(material, sensitivities(reroll, twin.law, error_mm=error, residual=residual), error)
+        return with_sensitivities(material, sensitivities(reroll, twin.law, error_mm=error, residual=residual), error)
 
 
-def determined(material: Material, felt: list[Sensitivity], error_mm: float) -> Material:
-    """``material`` with how well the motion determines it: standard errors go to the quantities that they are of."""
+def with_sensitivities(material: Material, found: list[Sensitivity], error_mm: float) -> Material:
+    """``material`` with how well the motion determines it: the sensitivities, and standard errors of its quantities."""
     of = {"shear modulus": ("shear modulus", "Young's modulus"), "bulk modulus": ("bulk modulus",),
           "flow strain": ("yield stress",), "yield stress": ("yield stress",), "friction angle": ("friction angle",),
           "relaxation time": ("relaxation time", "viscosity"), "viscosity": ("viscosity",)}  # fmt: skip
     quantities = dict(material.quantities)
-    for item in felt:
+    for item in found:
         for name in of.get(item.name, ()):
             if name in quantities and quantities[name].value is not None:
                 note = quantities[name].note
                 if item.moved_mm is not None and not item.excited:
                     note = "; ".join(part for part in (note, "not excited by this motion") if part)
                 quantities[name] = replace(quantities[name], stderr_percent=item.stderr_percent, note=note)
-    return replace(material, quantities=quantities, sensitivities=felt, error_mm=error_mm)
+    return replace(material, quantities=quantities, sensitivities=found, error_mm=error_mm)
 
 
 def paragraph(material: Material | dict[str, Any]) -> str:
-    """The answer in a few sentences; also of what material.json holds."""
+    """The answer in a few sentences, of a ``Material`` or of the content of material.json."""
     if isinstance(material, dict):
         return str(material["summary"])
     best = material.families[0]
-    numbers = [f"{name} {said(q)}" for name, q in material.quantities.items()]
+    numbers = [f"{name} {formatted(q)}" for name, q in material.quantities.items()]
     values = ", ".join(
-        f"{n.replace('_', ' ')} {said(Quantity(v['value'], v['unit'].strip('1')))}" for n, v in best.parameters.items()
+        f"{n.replace('_', ' ')} {formatted(Quantity(v['value'], v['unit'].strip('1')))}"
+        for n, v in best.parameters.items()
     )
     others = ", ".join(f"{m.kind} {m.misfit_percent:.0f} %" for m in material.families[1:])
     seen = material.excited
@@ -172,17 +177,17 @@ def paragraph(material: Material | dict[str, Any]) -> str:
         f"volume {100 * math.expm1(seen.log_volume[0]):+.1f} to {100 * math.expm1(seen.log_volume[1]):+.1f} %, "
         f"strain rates up to {seen.rate:.2g}/s.",
     ]
-    unfelt = [s.name for s in material.sensitivities if s.moved_mm is not None and not s.excited]
-    if unfelt:
+    unexcited = [s.name for s in material.sensitivities if s.moved_mm is not None and not s.excited]
+    if unexcited:
         text.append(
-            f"Not excited by this motion: {', '.join(unfelt)} (10 % more moves the body by less than a tenth of the "
+            f"Not excited by this motion: {', '.join(unexcited)} (10 % more moves the body by less than a tenth of the "
             f"fit's error of {material.error_mm:.1f} mm)."
         )
     return " ".join(text)
 
 
-def said(quantity: Quantity) -> str:
-    """'41 kPa ± 3 %', with the note where there is one."""
+def formatted(quantity: Quantity) -> str:
+    """'41 kPa ± 3 %', with the note if there is one."""
     if quantity.value is None:
         return quantity.note or "none"
     value, unit = quantity.value, quantity.unit
@@ -194,12 +199,12 @@ def said(quantity: Quantity) -> str:
     return text + (f" ({quantity.note})" if quantity.note else "")
 
 
-def _strength(law: Law, excited: Excited, lowest: float, rate: float) -> str:
-    """Whether a small shear stays elastic while it is loaded: always, under pressure only (granular) or never."""
+def _strength_kind(law: Law, excited: Excited, lowest: float, rate: float) -> str:
+    """SOLID if a small shear stays elastic while it is loaded, GRANULAR if it does under pressure only, else FLUID."""
     shear = float(np.clip(0.25 * excited.elastic_strain[1], 2e-4, 5e-3))
     hold = shear / rate
     if curves.kept_shear(law, shear, 0.0, hold) > 0.5:
-        return STRONG
+        return SOLID
     return GRANULAR if curves.kept_shear(law, 0.1 * abs(lowest), lowest, hold) > 0.5 else FLUID
 
 
@@ -218,7 +223,7 @@ def _elastic(kind: str, shear: float, bulk: float) -> dict[str, Quantity]:
 
 def _flow(law: Law, strain: float, dt: float) -> tuple[float, float]:
     """Shear stress [Pa] at the end of the loading, and the exponent with which it grows with the rate."""
-    amounts = math.sqrt(3) * strain * np.arange(1, POINTS + 1) / POINTS
+    amounts = math.sqrt(3) * strain * np.arange(1, LOADING_STEPS + 1) / LOADING_STEPS
     path = curves.simple_shear(amounts)[:, None]
     stress = [float(curves.drive(law, path, dt / quicker)[1][-1, 0, 0, 1]) for quicker in (1, 10)]
     if stress[0] <= 0 or stress[1] <= 0:
@@ -227,23 +232,23 @@ def _flow(law: Law, strain: float, dt: float) -> tuple[float, float]:
 
 
 def _yield(law: Law, kind: str, strain: float, dt: float) -> tuple[Quantity, bool]:
-    if kind != STRONG:
+    if kind != SOLID:
         return Quantity(0.0, "Pa", "no strength without pressure" if kind == GRANULAR else "a fluid has none"), True
-    curve = curves.uniaxial(law, -strain * np.arange(1, POINTS + 1) / POINTS, dt)
+    curve = curves.uniaxial(law, -strain * np.arange(1, LOADING_STEPS + 1) / LOADING_STEPS, dt)
     permanent = np.abs(np.concatenate([[0.0], curve.permanent]))
     stress = np.abs(np.concatenate([[0.0], curve.stress]))
-    after = np.flatnonzero(permanent >= OFFSET)
+    after = np.flatnonzero(permanent >= YIELD_OFFSET)
     if len(after) == 0:
         return Quantity(None, "Pa", f"none up to the strain observed ({100 * strain:.0f} %)"), False
     k = after[0]
-    share = (OFFSET - permanent[k - 1]) / (permanent[k] - permanent[k - 1])
+    share = (YIELD_OFFSET - permanent[k - 1]) / (permanent[k] - permanent[k - 1])
     value = stress[k - 1] + share * (stress[k] - stress[k - 1])
     return Quantity(float(value), "Pa", "uniaxial, 0.2 % permanent strain"), True
 
 
 def _friction(law: Law, log_volume: float, strain: float, dt: float) -> Quantity:
-    """From |tau_dev| = 3 alpha p in shear under pressure, alpha as of ``masiv.kernels.laws.drucker_prager``."""
-    amounts = math.sqrt(3) * strain * np.arange(1, POINTS + 1) / POINTS
+    """Friction angle from |tau_dev| = 3 alpha p in shear under pressure; alpha: ``kernels.laws.drucker_prager``."""
+    amounts = math.sqrt(3) * strain * np.arange(1, LOADING_STEPS + 1) / LOADING_STEPS
     stress = curves.drive(law, curves.simple_shear(amounts, log_volume)[:, None], dt)[1][-1, 0]
     pressure = -float(stress.trace()) / 3
     deviator = float(np.linalg.norm(stress.numpy() + pressure * np.eye(3)))
@@ -264,19 +269,19 @@ def _behaviour(kind: str, yields: bool, viscous: bool) -> str:
     return "an elastic solid that yields" + (", the faster the stiffer" if viscous else "")
 
 
-def _drawn(
+def _curves(
     law: Law, nearest: Match, excited: Excited, strain: float, log_volume: tuple[float, float], dt: float
 ) -> dict[str, dict[str, Any]]:
-    """Loading curves of the law and of the nearest family, wider than what was observed."""
+    """Loading curves of the law and of the nearest family, ``DRAWN_RANGE`` times the observed range."""
     from masiv.materials.classical import ClassicalLaw
 
     family = None
     if nearest.parameters:
         family = curves.in_float64(ClassicalLaw(nearest.kind, **{n: v["value"] for n, v in nearest.parameters.items()}))
-    reach = WIDER * strain
-    steps = np.arange(1, POINTS + 1) / POINTS
-    shear = curves.there_and_back(math.sqrt(3) * reach, POINTS)
-    volumes = [curves.dilation(WIDER * v * steps) for v in log_volume]
+    reach = DRAWN_RANGE * strain
+    steps = np.arange(1, LOADING_STEPS + 1) / LOADING_STEPS
+    shear = curves.there_and_back(math.sqrt(3) * reach, LOADING_STEPS)
+    volumes = [curves.dilation(DRAWN_RANGE * v * steps) for v in log_volume]
     out: dict[str, dict[str, Any]] = {}
 
     def add(
@@ -289,12 +294,12 @@ def _drawn(
         out[name] = {"strain": x, "stress_pa": stresses[0], "family_pa": stresses[1], "observed": seen}
 
     seen = (0.0, math.sqrt(3) * excited.strain[1])
-    add("simple shear, there and back", shear, curves.simple_shear(shear), (0, 1), WIDER * dt, seen)
-    stretched = curves.there_and_back(-reach, POINTS)
-    add("compression at constant volume, there and back", stretched, curves.stretch(stretched), None, WIDER * dt,
+    add("simple shear, there and back", shear, curves.simple_shear(shear), (0, 1), DRAWN_RANGE * dt, seen)
+    stretched = curves.there_and_back(-reach, LOADING_STEPS)
+    add("compression at constant volume, there and back", stretched, curves.stretch(stretched), None, DRAWN_RANGE * dt,
         (-excited.strain[1], 0.0))  # fmt: skip
-    add("compression of the volume", WIDER * log_volume[0] * steps, volumes[0], (0, 0), dt, excited.log_volume)
-    add("dilation of the volume", WIDER * log_volume[1] * steps, volumes[1], (0, 0), dt, excited.log_volume)
+    add("compression of the volume", DRAWN_RANGE * log_volume[0] * steps, volumes[0], (0, 0), dt, excited.log_volume)
+    add("dilation of the volume", DRAWN_RANGE * log_volume[1] * steps, volumes[1], (0, 0), dt, excited.log_volume)
     return out
 
 

@@ -1,4 +1,4 @@
-"""What a motion says of a law: the strains that it excited, and how far it would move if the law were another."""
+"""What a motion determines of a law: the strains that it excited, and its sensitivity to each property of the law."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from masiv.characterization.curves import deviatoric_strain, moduli_at_rest
 from masiv.errors import InputError, NonFiniteError
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.law import Law
-from masiv.materials.neural import NeuralLaw
+from masiv.materials.neural import NeuralLaw, output_layer
 
 if TYPE_CHECKING:
     from masiv.mpm.state import State
 
-NEIGHBOURS, SAMPLE = 12, 1500
-STEP = 1.1
-"""A tenth: the change of the finite difference."""
-FAINT = 0.1
-"""A change that moves the body by less than this share of the fit's error is not excited."""
+NEIGHBOURS, MAX_SAMPLES = 12, 1500
+"""Particles of a neighbourhood, and neighbourhoods whose deformation is measured."""
+PERTURBATION = 1.1
+"""Factor of the finite difference: 10 %."""
+MIN_EXCITED = 0.1
+"""A property is excited if 10 % of it move the body by at least this fraction of the fit's error."""
 
 
 @dataclass(frozen=True)
 class Excited:
-    """Over particles and frames: 1st and 99th percentile of the equivalent deviatoric Hencky strain that is elastic, of
-    the whole one since frame 0, and of the elastic ln J; 90th percentile of the deviatoric strain rate [1/s]."""
+    """Over particles and frames: 1st and 99th percentile of the elastic equivalent deviatoric Hencky strain, of the
+    total one since frame 0, and of the elastic ln J; 90th percentile of the deviatoric strain rate [1/s]."""
 
     elastic_strain: tuple[float, float]
     strain: tuple[float, float]
@@ -41,10 +42,11 @@ class Excited:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """moved_mm: RMS over particles and frames for 10 % more of it; None where the law lacks it or the motion diverged.
+    """Of a property of a law. moved_mm: RMS displacement [mm] over particles and frames for 10 % more of it; None if
+    the law lacks it or the motion diverged.
 
-    stderr_percent: from the fit's error, the others that are excited fitted with it, the launch held. None where it is
-    not excited or cannot be told from another.
+    stderr_percent: from the fit's error, if all excited properties are fitted and the initial motion is known. None if
+    the property is not excited or cannot be distinguished from another.
     """
 
     name: str
@@ -54,19 +56,19 @@ class Sensitivity:
 
 
 def excited_range(states: Iterable[State]) -> Excited:
-    """What the states of a rollout, one a frame, went through. Raises InputError where there is no frame after 0."""
+    """The range of strains of a rollout; states: one a frame. Raises InputError if there is no frame after frame 0."""
     elastic, whole, volume, rates = [], [], [], []
     rest, index = None, None
     for state in states:
         if rest is None or index is None:
             rest = state.position.double().numpy()
-            chosen = np.linspace(0, len(rest) - 1, min(SAMPLE, len(rest))).round().astype(int)
+            chosen = np.linspace(0, len(rest) - 1, min(MAX_SAMPLES, len(rest))).round().astype(int)
             index = cKDTree(rest).query(rest[chosen], k=min(NEIGHBOURS, len(rest)))[1]
             continue
         gradient = state.trial_gradient.double()
         elastic.append(deviatoric_strain(gradient))
         volume.append(torch.log(torch.linalg.det(gradient)))
-        whole.append(deviatoric_strain(_whole_gradient(rest[index], state.position.double().numpy()[index])))
+        whole.append(deviatoric_strain(_total_gradient(rest[index], state.position.double().numpy()[index])))
         rate = 0.5 * (state.affine_velocity + state.affine_velocity.mT).double()
         rate = rate - rate.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(3).double()
         rates.append((2 / 3) ** 0.5 * rate.norm(dim=(1, 2)))
@@ -80,7 +82,7 @@ def excited_range(states: Iterable[State]) -> Excited:
     return Excited(span(elastic), span(whole), span(volume), float(np.percentile(torch.cat(rates).numpy(), 90)))
 
 
-def _whole_gradient(rest: np.ndarray, now: np.ndarray) -> torch.Tensor:
+def _total_gradient(rest: np.ndarray, now: np.ndarray) -> torch.Tensor:
     """Least-squares gradients (M, 3, 3) that take neighbourhoods (M, k, 3) [m] from ``rest`` to ``now``."""
     before, after = rest - rest.mean(1, keepdims=True), now - now.mean(1, keepdims=True)
     spread = np.einsum("mki,mkj->mij", before, before)
@@ -89,14 +91,14 @@ def _whole_gradient(rest: np.ndarray, now: np.ndarray) -> torch.Tensor:
     return f[torch.linalg.det(f) > 0]
 
 
-def perturbed(law: Law, factor: float = STEP) -> dict[str, Law]:
-    """``law`` with one property at a time ``factor`` of what it is: those that its kind has, by name."""
+def perturbed(law: Law, factor: float = PERTURBATION) -> dict[str, Law]:
+    """``law`` with one property at a time multiplied by ``factor``, by name; the properties that its kind has."""
     if isinstance(law, NeuralLaw):
         return {
-            "shear modulus": _nudged(law, lambda new: new.elastic[-1].bias[:2].add_(math.log(factor))),
-            "bulk modulus": _nudged(law, lambda new: new.log_bulk_ratio.add_(math.log(factor))),
-            "flow strain": _nudged(law, lambda new: new.log_flow_strain.add_(math.log(factor))),
-            "relaxation time": _nudged(law, lambda new: new.plastic[-1].bias.sub_(math.log(factor))),
+            "shear modulus": _changed(law, lambda new: output_layer(new.elastic).bias[:2].add_(math.log(factor))),
+            "bulk modulus": _changed(law, lambda new: new.log_bulk_ratio.add_(math.log(factor))),
+            "flow strain": _changed(law, lambda new: new.log_flow_strain.add_(math.log(factor))),
+            "relaxation time": _changed(law, lambda new: output_layer(new.plastic).bias.sub_(math.log(factor))),
         }
     if not isinstance(law, ClassicalLaw):
         return {}
@@ -115,7 +117,7 @@ def perturbed(law: Law, factor: float = STEP) -> dict[str, Law]:
     return {name: ClassicalLaw(law.kind, **(values | change)) for name, change in changed.items()}
 
 
-def _nudged(law: NeuralLaw, change: Callable[[NeuralLaw], object]) -> NeuralLaw:
+def _changed(law: NeuralLaw, change: Callable[[NeuralLaw], object]) -> NeuralLaw:
     new = copy.deepcopy(law)
     with torch.no_grad():
         change(new)
@@ -139,31 +141,31 @@ def sensitivities(
 ) -> list[Sensitivity]:
     """How well a motion determines the properties of ``law``.
 
-    reroll: a law -> positions (T, Q, 3) [m] of the motion that it makes, frame 0 included. error_mm: of the fit, RMS
-    over particles. residual (T - 1, Q, 3): its shape tells how many of the data are independent (participation ratio of
-    its singular values); without it, each frame counts as one.
+    reroll: a law -> positions (T, Q, 3) [m] of its motion, frame 0 included. error_mm: RMS error of the fit over
+    particles. residual (T - 1, Q, 3) [m]: the participation ratio of its singular values is the number of independent
+    data; without it, each frame counts as one.
     """
     base = reroll(law)[1:].astype(np.float64)
     moved: dict[str, np.ndarray | None] = {}
     for name, other in perturbed(law).items():
         try:
-            moved[name] = 1e3 * (reroll(other)[1:] - base) * _to_a_tenth(law, other, name)
+            moved[name] = 1e3 * (reroll(other)[1:] - base) * _to_ten_percent(law, other, name)
         except NonFiniteError:
             moved[name] = None
     size = {name: None if d is None else float(np.sqrt((d**2).sum(2).mean())) for name, d in moved.items()}
-    felt = [name for name, value in size.items() if value is not None and value >= FAINT * error_mm]
-    stderr = _standard_errors([moved[name] for name in felt], error_mm, _independent(residual, len(base)))
-    by_name = dict(zip(felt, stderr, strict=True))
-    return [Sensitivity(name, value, name in felt, by_name.get(name)) for name, value in size.items()]
+    excited_names = [name for name, value in size.items() if value is not None and value >= MIN_EXCITED * error_mm]
+    stderr = _standard_errors([moved[name] for name in excited_names], error_mm, _independent(residual, len(base)))
+    by_name = dict(zip(excited_names, stderr, strict=True))
+    return [Sensitivity(name, value, name in excited_names, by_name.get(name)) for name, value in size.items()]
 
 
-def _to_a_tenth(law: Law, other: Law, name: str) -> float:
-    """What scales the change that was made to 10 %: the networks' outputs are bounded, so a nudge is not all felt."""
+def _to_ten_percent(law: Law, other: Law, name: str) -> float:
+    """Factor that scales the change to 10 %: outputs of the networks are bounded, so that less than 10 % may arrive."""
     if name not in ("shear modulus", "bulk modulus") or not isinstance(law, NeuralLaw):
         return 1.0
     which = 0 if name == "shear modulus" else 1
     made = math.log(moduli_at_rest(other)[which] / moduli_at_rest(law)[which])
-    return math.log(STEP) / made if made > 1e-3 else 1.0
+    return math.log(PERTURBATION) / made if made > 1e-3 else 1.0
 
 
 def _independent(residual: np.ndarray | None, frames: int) -> float:
@@ -180,9 +182,9 @@ def _standard_errors(moved: list[np.ndarray | None], error_mm: float, independen
     if len(gram) == 0:
         return []
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    told_apart = values > 1e-4
-    # A direction that the data do not see leaves those that take part in it unknown.
-    unknown = (vectors[:, ~told_apart] ** 2).sum(1) > 0.05
-    inverse = (vectors[:, told_apart] / values[told_apart]) @ vectors[:, told_apart].T
+    distinguished = values > 1e-4
+    # A direction that the data do not determine leaves the properties in it unknown.
+    unknown = (vectors[:, ~distinguished] ** 2).sum(1) > 0.05
+    inverse = (vectors[:, distinguished] / values[distinguished]) @ vectors[:, distinguished].T
     stderr = 10 * error_mm * np.sqrt(np.diag(inverse) / independent) / scale
     return [None if u else float(e) for u, e in zip(unknown, stderr, strict=True)]

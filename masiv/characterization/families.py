@@ -1,10 +1,11 @@
-"""Which classical material a law resembles: each family with the parameters that bring its responses nearest."""
+"""Which classical law resembles a law most: each family is fitted to its stress responses."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,53 +16,54 @@ from masiv.errors import InputError
 from masiv.materials.classical import PARAMETERS, UNITS, ClassicalLaw
 from masiv.materials.law import Law
 
-POINTS = 24
+COMPARED_STRAINS = 24
 """Strains at which responses are compared, each way."""
-REFINED = 4
-"""Increments from point to point of the law itself and of families whose flow depends on the path or the rate."""
-FAINT = 0.05
-"""A response below this share of the mean one counts by the mean one: its own misfit would be noise over nothing."""
-TIE = 0.5
-"""Misfits this near [%] are equal: the family with fewer parameters comes first."""
+FINE_INCREMENTS = 4
+"""Increments between two of them, for the law itself and for families whose flow depends on path or rate."""
+MIN_RELATIVE_RESPONSE = 0.05
+"""Responses are scaled by their own RMS, but by at least this fraction of the RMS of all."""
+MISFIT_TIE = 0.5
+"""Difference of misfits [%] that counts as none: the family with fewer parameters comes first."""
 BOUNDS = {"poissons_ratio": (-0.9, 0.499), "friction_angle": (1.0, 80.0)}
 
 
 @dataclass(frozen=True)
 class Match:
-    """A family and how far its responses are from the law's over the observed range: RMS over paths, in % of them."""
+    """A family of laws: RMS difference [%] of its responses from the law's over the observed range; its parameters."""
 
     kind: str
     misfit_percent: float
-    parameters: dict[str, dict[str, float | str]]
+    parameters: dict[str, dict[str, Any]]
 
 
 def nearest_families(law: Law, *, strain: float, log_volume: tuple[float, float], rate: float) -> list[Match]:
-    """Every family that can be matched, nearest first.
+    """Every family that can be fitted, nearest first.
 
     The paths go there and back: shear at rest volume and compressed to log_volume[0], stretch and compression at
     constant volume, all to the equivalent ``strain``, and changes of volume to ``log_volume``, at ``rate`` [1/s].
     """
     law = curves.in_float64(law)
-    dt = strain / (rate * POINTS)
-    fine = _paths(strain, log_volume, POINTS * REFINED)
-    target = curves.drive(law, fine, dt / REFINED)[1][REFINED - 1 :: REFINED]
+    dt = strain / (rate * COMPARED_STRAINS)
+    fine = _paths(strain, log_volume, COMPARED_STRAINS * FINE_INCREMENTS)
+    target = curves.drive(law, fine, dt / FINE_INCREMENTS)[1][FINE_INCREMENTS - 1 :: FINE_INCREMENTS]
     power = target.square().sum((2, 3)).mean(0)
-    scale = torch.sqrt(torch.maximum(power, FAINT**2 * power.mean()))[None, :, None, None]
-    coarse = _paths(strain, log_volume, POINTS)
+    scale = torch.sqrt(torch.maximum(power, MIN_RELATIVE_RESPONSE**2 * power.mean()))[None, :, None, None]
+    coarse = _paths(strain, log_volume, COMPARED_STRAINS)
     guesses = _guesses(law, target)
     found = []
     for kind, names in PARAMETERS.items():
         if set(names) <= guesses.keys():
-            refined = REFINED if any("viscosity" in name or "angle" in name for name in names) else 1
+            refined = FINE_INCREMENTS if any("viscosity" in name or "angle" in name for name in names) else 1
             paths = fine if refined > 1 else coarse
-            match = _matched(kind, [guesses[name] for name in names], paths, dt / refined, target, scale)
+            match = _fit_family(kind, [guesses[name] for name in names], paths, dt / refined, target, scale)
             found.append(match)
     best = min(match.misfit_percent for match in found)
-    return sorted(
-        found,
-        key=lambda m: (m.misfit_percent > best + TIE, len(m.parameters) * (m.misfit_percent <= best + TIE),
-                       m.misfit_percent),
-    )  # fmt: skip
+    near = [match for match in found if match.misfit_percent <= best + MISFIT_TIE]
+    others = [match for match in found if match.misfit_percent > best + MISFIT_TIE]
+    return [
+        *sorted(near, key=lambda m: (len(m.parameters), m.misfit_percent)),
+        *sorted(others, key=lambda m: m.misfit_percent),
+    ]
 
 
 def _paths(strain: float, log_volume: tuple[float, float], points: int) -> torch.Tensor:
@@ -98,11 +100,11 @@ def _guesses(law: Law, target: torch.Tensor) -> dict[str, float]:
     }
 
 
-def _matched(
+def _fit_family(
     kind: str, start: list[float], paths: torch.Tensor, dt: float, target: torch.Tensor, scale: torch.Tensor
 ) -> Match:
     names = PARAMETERS[kind]
-    ways = [_scaled(name) for name in names]
+    ways = [_transforms(name) for name in names]
 
     def values(x: np.ndarray) -> dict[str, float]:
         return {name: back(float(v)) for name, (_, back), v in zip(names, ways, x, strict=True)}
@@ -124,8 +126,8 @@ def _matched(
     return Match(kind, misfit, {n: {"value": v, "unit": UNITS[n]} for n, v in values(found.x).items()})
 
 
-def _scaled(name: str) -> tuple[Callable[[float], float], Callable[[float], float]]:
-    """Parameter -> what is fitted, and back: a logit within bounds, a logarithm where there is none."""
+def _transforms(name: str) -> tuple[Callable[[float], float], Callable[[float], float]]:
+    """Parameter -> fitted variable, and back: a logit within bounds, a logarithm without."""
     if name not in BOUNDS:
         return math.log, math.exp
     low, high = BOUNDS[name]

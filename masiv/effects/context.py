@@ -1,4 +1,4 @@
-"""What an effect declares of its parameters, and what it is told of the scene."""
+"""What an effect declares of its parameters, and what it may know of the scene."""
 
 from __future__ import annotations
 

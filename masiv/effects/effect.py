@@ -1,6 +1,6 @@
 r"""The kinds of effects: physics that a model may lack. At zero strength an effect changes nothing.
 
-A kind says at which place of the model an effect acts, and has one abstract method. In a substep of MLS-MPM
+A kind determines where in the model an effect acts, and has one abstract method. In a substep of MLS-MPM
 (``masiv.kernels.mpm``) they act in this order:
 
 1. ``StressEffect``: Kirchhoff stress of the particles, after the law;
@@ -43,7 +43,7 @@ class Effect(ABC):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if cls.__module__ != __name__ and not issubclass(cls, KINDS):
-            raise TypeError(f"{cls.__name__} says nowhere it acts: derive it from one of the kinds in {__name__}")
+            raise TypeError(f"{cls.__name__} acts nowhere: derive it from one of the kinds in {__name__}")
 
     def guesses(self, context: EffectContext) -> list[tuple[float, ...]]:
         """Values of the parameters after the strengths that a search tries, each a tuple."""

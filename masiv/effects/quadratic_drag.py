@@ -29,7 +29,7 @@ class QuadraticDrag(NodalEffect):
     r"""$\dot v = -c\,|v|\,v$ (Newton), exact over a substep: $v \leftarrow v / (1 + c\,\Delta t\,|v|)$."""
 
     name = "quadratic_drag"
-    looks_like = "fast parts slow down most: a throw loses speed early, a slow spin hardly changes"
+    looks_like = "fast parts slow down most: a flight loses speed early, a slow spin hardly changes"
     parameters = (EffectParameter("coefficient", "1/m", 0.0, 20.0, 0.02),)
     per_body = _NewtonDrag()
 

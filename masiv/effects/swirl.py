@@ -22,7 +22,7 @@ def _far_axis(theta: torch.Tensor, duration: float, places: torch.Tensor) -> str
     middle = arms.mean(0)
     if float(middle.square().sum()) < MAX_UNIFORM_FRACTION * float(arms.square().sum(1).mean()):
         return None
-    return f"its axis is {float(torch.linalg.vector_norm(middle)):.2g} m away, where it is but a uniform force"
+    return f"its axis is {float(torch.linalg.vector_norm(middle)):.2g} m away, where it is no more than a uniform force"
 
 
 def _guesses(context: EffectContext) -> list[tuple[float, ...]]:

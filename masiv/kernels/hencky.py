@@ -5,10 +5,10 @@ import taichi as ti
 
 from masiv.kernels.tensor import adjugate, deviator, identity3, symmetric_product
 
-ARTANH = tuple((2 * k - 1, 2 * k + 1) for k in range(1, 9))
-EXPM1 = tuple((1, k) for k in range(2, 9))
-"""artanh(z) / z in z^2 and (exp(x) - 1) / x in x for ``power_series``: float64's digits where tr(Z^2) < 0.02, |X|^2 <
-0.004."""
+ARTANH_RATIOS = tuple((2 * k - 1, 2 * k + 1) for k in range(1, 9))
+EXPM1_RATIOS = tuple((1, k) for k in range(2, 9))
+"""artanh(z) / z in z^2 and (exp(x) - 1) / x in x for ``power_series``: accurate to float64 for tr(Z^2) < 0.02 and
+|X|^2 < 0.004."""
 
 
 @ti.func
@@ -82,7 +82,7 @@ def hencky_strain(f):
     j = f.determinant()
     strain = ti.zero(z)
     if z2.trace() < 0.02 and j > 0.0:
-        strain = symmetric_product(z, power_series(z2, ARTANH))
+        strain = symmetric_product(z, power_series(z2, ARTANH_RATIOS))
     else:
         x = deviator(x)
         size = ti.sqrt(x.norm_sqr() / 6.0)
@@ -102,7 +102,7 @@ def with_strain_change(f, change):
     """exp(change) F: what F becomes when ``change``, which commutes with ln V, is added to its Hencky strain."""
     near = change.norm_sqr() < 0.004
     part = ti.select(near, 1.0, 1.0 / 64.0) * change
-    grown = symmetric_product(part, power_series(part, EXPM1))
+    grown = symmetric_product(part, power_series(part, EXPM1_RATIOS))
     if not near:  # (I + G)^64 - I
         for _ in ti.static(range(6)):
             grown = 2.0 * grown + symmetric_product(grown, grown)

@@ -41,7 +41,7 @@ def invariants_adjoint(f, bar):
 @ti.func
 def stress(strain, c):
     """Kirchhoff stress from coefficients c = (g1, g2, kappa, m) [Pa]:
-    g1 dev(b) - g2 dev(b^-1) + (kappa (J - 1/J)/2 + m (tr b - 3)) I. Zero at F = I whatever c is."""
+    g1 dev(b) - g2 dev(b^-1) + (kappa (J - 1/J)/2 + m (tr b - 3)) I. Zero at F = I for all c."""
     j, b, b_inverse = strain[1], strain[3], strain[4]
     pressure = c[2] * 0.5 * (j - 1.0 / j) + c[3] * (b.trace() - 3.0)
     return c[0] * deviator(b) - c[1] * deviator(b_inverse) + pressure * identity3()
@@ -91,7 +91,7 @@ def flow(f, strain, c):
 
 @ti.func
 def flow_adjoint(f, strain, c, out, out_bar):
-    """Adjoints of c, F where the strain is held, ln J, b and b^-1 in ``flow``, whose result was ``out``."""
+    """Adjoints of c, of F at constant strain, of ln J, b and b^-1 in ``flow``, whose result was ``out``."""
     direction, per_share = flow_direction(strain)
     factor = c[0] * per_share
     below, above, log_det = cayley(factor * direction)

@@ -109,7 +109,7 @@ class InvariantKernels:
 
     @ti.kernel
     def flow(self, s: ti.i32, share: ti.types.ndarray(), out: ti.types.ndarray()):
-        """Apply the flow, and give the invariants (N, 3) of what is left."""
+        """Apply the flow, and write the invariants (N, 3) of the remaining strain."""
         for p in range(out.shape[0]):
             trial, c = self.mpm.trial_gradient[s, p], ti.Vector([share[p, 0], share[p, 1]])
             f = isotropic.flow(trial, isotropic.isochoric_strain(trial), c)

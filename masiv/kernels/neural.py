@@ -1,7 +1,7 @@
 """Kernels that apply the neural law to the fields of a simulator, and their adjoint.
 
-The networks are functions of three numbers, so their values on a lattice (``masiv.materials.table``) are the law: a
-particle interpolates the lattice, the adjoint scatters to it, and the networks run once a rollout, not once a substep.
+The networks are functions of three numbers, and the law interpolates their values on a lattice
+(``masiv.kernels.lattice``). The networks run once a rollout, not once a substep; the adjoint scatters to the lattice.
 """
 
 import taichi as ti
@@ -104,7 +104,7 @@ class NeuralKernels:
 
     @ti.func
     def locate(self, feature):
-        """Lattice cell of a feature vector, position in it, and 1 / step where the feature is within the lattice."""
+        """Lattice cell of a feature vector, position in it, and its derivative: 1 / step within the lattice, else 0."""
         cell = ti.Vector.zero(ti.i32, 3)
         inside = ti.Vector.zero(self.mpm.real, 3)
         slope = ti.Vector.zero(self.mpm.real, 3)
@@ -154,7 +154,7 @@ class NeuralKernels:
 
     @ti.func
     def share(self, flow):
-        """1 - exp(-flow), also where that is below the rounding of 1."""
+        """1 - exp(-flow), accurate for small flow too."""
         out = flow * (1.0 - 0.5 * flow * (1.0 - flow / 3.0))
         for a in ti.static(range(2)):
             if flow[a] >= 0.01:

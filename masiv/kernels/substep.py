@@ -1,8 +1,9 @@
 """Parts of a substep in one launch, on a CPU.
 
-A launch costs about as much as the transfer of 1500 particles to the grid, so whole substeps without effects are one
-launch, or many of them where they run on one thread. (With effects it is the grid's update that knows them: a kernel of
-the whole for each set of effects would take seconds to compile.)"""
+A launch costs about as much as the transfer of 1500 particles to the grid. So a whole substep without effects is one
+launch, and several substeps are one if they run on one thread. With effects, only the grid's update is specialised: a
+kernel of the whole substep for each set of effects would take seconds to compile.
+"""
 
 import taichi as ti
 
@@ -10,8 +11,8 @@ import taichi as ti
 @ti.data_oriented
 class SubstepKernels:
     """law: kernels with Taichi functions ``flow_particle(s, p)``, trial gradient -> elastic gradient, and
-    ``stress_particle(s, p)``, from there to the stress. serial: ``advance`` runs on one thread; the result is the same
-    but for rounding."""
+    ``stress_particle(s, p)``, from there to the stress. serial: ``advance`` runs on one thread; the results differ in
+    rounding only."""
 
     def __init__(self, mpm, law, serial: bool):
         self.mpm = mpm
@@ -32,7 +33,7 @@ class SubstepKernels:
 
     @ti.func
     def on_grid(self, t: ti.i32, s: ti.i32, begin: ti.i32, nodes: ti.i32, log: ti.i32):
-        """Chunk t of the rows; their momenta are kept where the log has room, or in its scratch at 0."""
+        """Chunk t of the rows; their momenta are kept if the log has room, else they go to its scratch at 0."""
         place = log + (s - begin) * nodes
         offset = ti.select(place + nodes <= self.mpm.capacity_log, place, 0)
         rows = self.mpm.rows()
@@ -48,7 +49,7 @@ class SubstepKernels:
 
     @ti.kernel
     def advance(self, begin: ti.i32, end: ti.i32, count: ti.i32, nodes: ti.i32, log: ti.i32):
-        """Substeps begin…end-1, one where not ``serial``; log: where the grid of ``begin`` is kept."""
+        """Substeps begin … end - 1, a single one if not ``serial``; log: first entry of the grid of ``begin``."""
         if ti.static(self.serial):
             ti.loop_config(serialize=True)
             for s in range(begin, end):

@@ -40,7 +40,7 @@ def sandwich(a, x):
 
 @ti.func
 def symmetric_product(a, b):
-    """A B where both it and B are symmetric: of symmetric matrices, where they have the same eigenvectors."""
+    """A B if it is symmetric, as that of symmetric matrices with the same eigenvectors; B is symmetric."""
     return symmetric(
         a[0, 0] * b[0, 0] + a[0, 1] * b[0, 1] + a[0, 2] * b[0, 2],
         a[0, 0] * b[0, 1] + a[0, 1] * b[1, 1] + a[0, 2] * b[1, 2],

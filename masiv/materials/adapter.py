@@ -1,12 +1,12 @@
 """A classical law with a small learnt correction of low rank (the idea of NeuMA, Cao et al. 2024).
 
 The classical law is written in invariants of the elastic strain, as the neural law is: stress in the isotropic tensor
-basis with coefficients c(J, I1, I2), flow as the share of the strain that goes within a substep. The correction
+basis with coefficients c(J, I1, I2), flow as the share of the strain that relaxes within a substep. The correction
 multiplies the moduli, and the resistance to flow (yield strain, relaxation time), by exp of A B h(invariants), h a
-small network, B of few rows, A zero at the start. Whatever the weights are, the law is at rest at F = I, isotropic and
+small network, B of few rows, A zero at the start. For all weights the law is at rest at F = I, isotropic and
 frame indifferent, with positive moduli; at the start it is the classical law (Hencky's strain to third order).
 
-differs from NeuMA: that adds low-rank matrices to the weights of a neural law, taught from the classical one.
+differs from NeuMA: that adds low-rank matrices to the weights of a neural law, trained on the classical one.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from masiv.materials.neural import NeuralLaw, strain_invariants
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
 
-STRAIN = 0.02
+FEATURE_STRAIN = 0.02
 """Strain [1] beyond which the correction sees invariants logarithmically."""
-REACH = 2.0
-"""Corrections are factors of exp(-REACH) to exp(REACH)."""
-TINY = 1e-12
+MAX_LOG_FACTOR = 2.0
+"""Corrections are factors of exp(-MAX_LOG_FACTOR) to exp(MAX_LOG_FACTOR)."""
+MIN_STRAIN = 1e-12
 
 
 class AdapterLaw(Law):
@@ -52,8 +52,8 @@ class AdapterLaw(Law):
 
     def correction(self, invariants: torch.Tensor) -> torch.Tensor:
         """Logarithms (N, 4) of the factors on g1, g2, kappa and on the resistance to flow."""
-        hidden = torch.tanh(self.hidden(NeuralLaw.features(invariants, STRAIN)))
-        return REACH * torch.tanh(self.up(self.down(hidden)) / REACH)
+        hidden = torch.tanh(self.hidden(NeuralLaw.features(invariants, FEATURE_STRAIN)))
+        return MAX_LOG_FACTOR * torch.tanh(self.up(self.down(hidden)) / MAX_LOG_FACTOR)
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
         """Coefficients (N, 4) [Pa] of ``masiv.kernels.isotropic.stress`` from invariants (N, 3)."""
@@ -172,10 +172,10 @@ def base_flow_share(law: ClassicalLaw, invariants: torch.Tensor, dt: float, resi
 
 
 def hencky_size(invariants: torch.Tensor) -> torch.Tensor:
-    """|dev ln V| (N,) to third order, from |dev(b - b^-1)|^2 by Cayley and Hamilton. At least ``TINY``."""
+    """|dev ln V| (N,) to third order, from |dev(b - b^-1)|^2 by Cayley and Hamilton. At least ``MIN_STRAIN``."""
     first, second = invariants[:, 1], invariants[:, 2]
     square = 4 * (first + second) + first**2 + second**2 - (first - second) ** 2 / 3
-    return torch.sqrt(torch.relu(square) / (1 + (first + second) / 6) / 16 + TINY**2)
+    return torch.sqrt(torch.relu(square) / (1 + (first + second) / 6) / 16 + MIN_STRAIN**2)
 
 
 class _BoundAdapter(BoundLaw):

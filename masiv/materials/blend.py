@@ -15,8 +15,8 @@ from masiv.materials.neural import NeuralLaw
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
 
-SHORT = 1e-9
-"""A time [s] within which even the quickest flow of a neural law is small: its share gives the rate."""
+RATE_TIME = 1e-9
+"""Time [s] within which even the fastest flow of a neural law is small, so that its share gives the rate."""
 
 
 def blend(first: Law, second: Law, weight: float) -> Law:
@@ -43,11 +43,11 @@ def blend(first: Law, second: Law, weight: float) -> Law:
 class BlendedLaw(Law):
     """Two neural laws: flow rates r = r_1^(1 - w) r_2^w, stresses (1 - w) tau_1 + w tau_2.
 
-    Rates lie decades apart (an elastic body's e^-14 and a fluid's e^14 per second), so their geometric mean is what
-    lies between. In steady flow a law alone carries an elastic strain inversely proportional to its rate: the one that
-    flows faster than the blend takes part with the share min(1, r / r_i) of the strain, which it knows, and not with
-    one that it would never have let build up. Both laws are at rest at F = I, isotropic and frame indifferent, with
-    positive moduli, and so is the blend; it depends on the substep as little as they do. Forward only.
+    Rates are decades apart (e^-14 of an elastic body, e^14 per second of a fluid), so they are blended geometrically.
+    In steady flow the elastic strain of a law is inversely proportional to its rate. So the law that flows faster than
+    the blend is evaluated at the fraction min(1, r / r_i) of the strain: it would never have reached all of it. Both laws
+    are at rest at F = I, isotropic and frame indifferent, with positive moduli, and so is the blend; it does not depend
+    on the substep either. Forward only.
     """
 
     kind = "blended"
@@ -58,7 +58,9 @@ class BlendedLaw(Law):
 
     def log_rates(self, invariants: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Logarithms (N, 2) of the isochoric and volumetric flow rates [1/s]: of the blend, the first, the second."""
-        first, second = (torch.log(law.flow(invariants, SHORT)) - math.log(SHORT) for law in (self.first, self.second))
+        first, second = (
+            torch.log(law.flow(invariants, RATE_TIME)) - math.log(RATE_TIME) for law in (self.first, self.second)
+        )
         return (1 - self.weight) * first + self.weight * second, first, second
 
     def moduli(self, invariants: torch.Tensor) -> torch.Tensor:
@@ -66,7 +68,7 @@ class BlendedLaw(Law):
         blended, *own = self.log_rates(invariants)
         parts = []
         for law, log_rate in zip((self.first, self.second), own, strict=True):
-            shape, volume = torch.exp((_felt(blended) - _felt(log_rate)).clamp_max(0)).unbind(1)
+            shape, volume = torch.exp((_at_least_one(blended) - _at_least_one(log_rate)).clamp_max(0)).unbind(1)
             carried = invariants * torch.stack([volume, shape**2, shape**2], dim=1)
             parts.append(law.moduli(carried) * torch.stack([shape, shape, volume, shape**2], dim=1))
         return (1 - self.weight) * parts[0] + self.weight * parts[1]
@@ -105,8 +107,8 @@ class BlendedLaw(Law):
         }
 
 
-def _felt(log_rate: torch.Tensor) -> torch.Tensor:
-    """A flow that takes longer than a second is none: how slow it is must not weigh."""
+def _at_least_one(log_rate: torch.Tensor) -> torch.Tensor:
+    """Logarithm of a rate of at least 1 per second: slower flows count as none, however slow they are."""
     return log_rate.clamp_min(0)
 
 

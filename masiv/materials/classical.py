@@ -14,14 +14,14 @@ from masiv.materials.law import BoundLaw, Law, SharedBoundLaw
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
 
-ELASTIC = ("youngs_modulus", "poissons_ratio")
+ELASTIC_PARAMETERS = ("youngs_modulus", "poissons_ratio")
 PARAMETERS = {
-    "neo_hookean": ELASTIC,
-    "water": ELASTIC,
+    "neo_hookean": ELASTIC_PARAMETERS,
+    "water": ELASTIC_PARAMETERS,
     "newtonian": ("viscosity", "bulk_modulus"),
-    "von_mises": (*ELASTIC, "yield_stress"),
+    "von_mises": (*ELASTIC_PARAMETERS, "yield_stress"),
     "non_newtonian": ("shear_modulus", "bulk_modulus", "yield_stress", "plastic_viscosity"),
-    "drucker_prager": (*ELASTIC, "friction_angle"),
+    "drucker_prager": (*ELASTIC_PARAMETERS, "friction_angle"),
 }
 UNITS = {
     "youngs_modulus": "Pa",
@@ -34,12 +34,14 @@ UNITS = {
     "friction_angle": "deg",
 }
 RANGES = {"poissons_ratio": (-1.0, 0.5), "friction_angle": (0.0, 90.0)}
-"""Where a parameter must lie; (0, infinity) where none is given."""
+"""Open intervals of the parameters; (0, infinity) for the others."""
 DIFFERENTIABLE = ("neo_hookean", "water")
+"""Laws whose kernels have an adjoint."""
 MAXWELL_SHARE = 0.25
 MAXWELL_TIME = 2e-3
-"""The shear modulus of a Newtonian fluid is that share of its bulk modulus plus viscosity / that time [s]: it relaxes
-within the time, far less than a flow takes to change between two frames, and hardly shortens the substep."""
+"""The shear modulus of a Newtonian fluid is MAXWELL_SHARE of its bulk modulus plus viscosity / MAXWELL_TIME [s]. Its
+shear stress relaxes within MAXWELL_TIME, much faster than a flow changes between two frames, and hardly shortens the
+substep."""
 
 
 def lame(youngs_modulus: torch.Tensor, poissons_ratio: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -51,7 +53,7 @@ def lame(youngs_modulus: torch.Tensor, poissons_ratio: torch.Tensor) -> tuple[to
 class ClassicalLaw(Law):
     """A law of ``PARAMETERS``, its parameters given by name in the units of ``UNITS``.
 
-    ``stderr``: standard errors of the parameters by name, where they were estimated.
+    ``stderr``: standard errors of the parameters by name, if they were estimated.
     Raises InputError for an unknown kind, missing or unknown parameters, and values outside of their range.
     """
 
@@ -163,7 +165,7 @@ class ClassicalLaw(Law):
         return _BoundClassical(self, kernels, count, dt)
 
     def description(self) -> dict[str, Any]:
-        """An estimated parameter also has ``stderr``, None where the data does not tell it."""
+        """An estimated parameter also has ``stderr``, None if the data do not determine it."""
         values: dict[str, dict[str, Any]] = {}
         for name, value in self.values.items():
             values[name] = {"value": float(value.detach()), "unit": UNITS[name]}

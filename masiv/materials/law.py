@@ -34,7 +34,7 @@ class BoundLaw(ABC):
         mpm.p2g(s, count, nodes)
 
     def substeps(self, mpm: MpmKernels, serial: bool) -> SubstepKernels | None:
-        """Kernels of whole substeps with this law, ready to be launched; None where it has none, and on a GPU."""
+        """Kernels of whole substeps with this law, ready to be launched; None if it has none, and on a GPU."""
         return None
 
     @abstractmethod
@@ -131,10 +131,10 @@ class Law(torch.nn.Module, ABC):
 
     @abstractmethod
     def description(self) -> dict[str, Any]:
-        """What ``twin.yaml`` says of the law: kind and readable parameters with units."""
+        """The law in ``twin.yaml``: kind, and parameters with units."""
 
     def file_metadata(self) -> dict[str, str]:
-        """What a file of this law needs besides its weights to be read again."""
+        """Metadata that a file of this law needs in addition to its weights."""
         return {"kind": self.kind}
 
     def save(self, path: Path) -> None:

@@ -15,7 +15,7 @@ from masiv.materials.neural import NeuralLaw
 
 
 def load_law(path: Path) -> Law:
-    """The law in ``path``. Raises InputError where it is missing or is something else."""
+    """The law in ``path``. Raises InputError if it is missing or is not a law."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}

@@ -1,4 +1,4 @@
-"""The neural constitutive law: isotropic, frame indifferent, at rest at F = I, whatever its weights are.
+"""The neural constitutive law: isotropic, frame indifferent and at rest at F = I for all weights.
 
 Stress is a combination of the isotropic tensor basis of the left Cauchy-Green tensor, flow a relaxation of the elastic
 strain at a rate; two small networks give the coefficients from three invariants of the strain. With positive moduli the
@@ -6,10 +6,10 @@ principal stresses are ordered as the principal stretches are (the Baker-Erickse
 compression. The flow is a rate, so the law does not depend on the substep: elastic bodies, viscous fluids, plasticity
 and sand are relaxation times that depend on strain in different ways.
 
-A rate that is taken from the strain before a substep overshoots where it rises steeply, as at a yield stress: more
-strain would leave less of it. The motion then chatters a little, and its derivative grows by a factor a substep. So the
-strain that flows within a substep is bounded such that what is kept never falls where the strain rises: the steepest
-law is perfect plasticity, whose derivative is none.
+A rate that is evaluated at the strain before a substep overshoots if it rises steeply with the strain, as at a yield
+stress: a larger strain would end as a smaller one. The motion then chatters a little, and its derivative grows by a
+factor each substep. So the flow within a substep is bounded (``table.lipschitz_envelope``) such that a larger strain
+never ends as a smaller one. The steepest law is perfect plasticity, whose derivative is zero.
 
 differs from MASIV and NCLaw: their networks see F^T F entry by entry (frame indifferent but not isotropic) and correct
 F once a substep, which ties the law to the substep.
@@ -49,11 +49,11 @@ def strain_invariants(deformation_gradient: torch.Tensor) -> torch.Tensor:
 class NeuralLaw(Law):
     """Two networks 3 -> width -> width -> coefficients, and four scales learnt as logarithms.
 
-    The networks are known by their values on a lattice of strain features, between whose nodes the law is interpolated.
+    The law interpolates values of the networks on a lattice of strain features (``masiv.materials.table``).
 
     The elastic network gives log moduli relative to the stress scale [Pa], the plastic one log relaxation rates [1/s]
-    of strains relative to the flow strain. Moving the scales makes another material of one kind: its stiffness, its
-    resistance to compression over that to shear, its yield strain, and how fast it flows.
+    of strains relative to the flow strain. The scales change the stiffness, the ratio of bulk
+    to shear modulus, the yield strain and the rate of flow, and keep the kind of material.
     """
 
     kind = "neural"
@@ -73,19 +73,24 @@ class NeuralLaw(Law):
     def maxwell(
         cls, *, shear_modulus: float, bulk_modulus: float, relaxation_time: float, width: int = 24, seed: int = 0
     ) -> NeuralLaw:
-        """A Maxwell fluid: moduli [Pa] and relaxation time [s] are the same at all strains. In motions that are slow
-        beside the relaxation time it is Newtonian, of viscosity shear modulus x relaxation time [Pa s]."""
+        """A Maxwell fluid: moduli [Pa] and relaxation time [s] are the same at all strains.
+
+        In motions that are slow compared with the relaxation time it is Newtonian, of viscosity shear modulus x
+        relaxation time [Pa s].
+        """
         law = cls.of_moduli(shear_modulus=shear_modulus, bulk_modulus=bulk_modulus, width=width, seed=seed)
         rate = LOG_RATE_RANGE * math.atanh(-math.log(relaxation_time) / LOG_RATE_RANGE)
-        _constant(law.plastic, (rate, -2 * LOG_RATE_RANGE))
+        _set_constant(law.plastic, (rate, -2 * LOG_RATE_RANGE))
         return law
 
     @classmethod
     def of_moduli(cls, *, shear_modulus: float, bulk_modulus: float, width: int = 24, seed: int = 0) -> NeuralLaw:
-        """A law whose moduli [Pa] are the same at all strains; how it flows is as the seed has it."""
+        """A law whose moduli [Pa] are the same at all strains; its flow is random, from the seed."""
         law = cls(stress_scale=shear_modulus, width=width, seed=seed)
         bulk = LOG_MODULUS_RANGE * math.atanh(math.log(bulk_modulus / shear_modulus) / LOG_MODULUS_RANGE)
-        _constant(law.elastic, (0.0, -2 * LOG_MODULUS_RANGE, bulk, 0.0))  # g2: as little as the networks can say
+        _set_constant(
+            law.elastic, (0.0, -2 * LOG_MODULUS_RANGE, bulk, 0.0)
+        )  # g2: the smallest that the networks can give
         return law
 
     def scales(self) -> list[torch.nn.Parameter]:
@@ -188,7 +193,7 @@ class NeuralLaw(Law):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Of a law that was written before it had a bulk ratio and a flow rate, too: both were 1."""
+        """Also of a law from a file without bulk ratio and flow rate, which are 1 then."""
         ones = {name: torch.zeros(()) for name in ("log_bulk_ratio", "log_flow_rate")}
         return super().load_state_dict({**ones, **state_dict}, strict, assign)
 
@@ -204,11 +209,18 @@ def _network(width: int, outputs: int, generator: torch.Generator) -> torch.nn.S
     return torch.nn.Sequential(layers[0], torch.nn.GELU(), layers[1], torch.nn.GELU(), layers[2])
 
 
-def _constant(network: torch.nn.Sequential, values: tuple[float, ...]) -> None:
-    """Let ``network`` give ``values``, whatever it is given."""
+def output_layer(network: torch.nn.Sequential) -> torch.nn.Linear:
+    """The last layer of a network of a ``NeuralLaw``."""
+    layer = network[-1]
+    assert isinstance(layer, torch.nn.Linear)
+    return layer
+
+
+def _set_constant(network: torch.nn.Sequential, values: tuple[float, ...]) -> None:
+    """Let ``network`` return ``values`` for every input."""
     with torch.no_grad():
-        network[-1].weight.zero_()
-        network[-1].bias.copy_(torch.tensor(values))
+        output_layer(network).weight.zero_()
+        output_layer(network).bias.copy_(torch.tensor(values))
 
 
 def _trace(a: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""A slow twin of one MLS-MPM substep in plain torch: any dtype, gradients by autograd. For tests."""
+"""One MLS-MPM substep in plain torch, slow: any dtype, gradients by autograd. The reference of tests."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def substeps_per_frame(
 ) -> int:
     """Substeps in a frame such that sound and matter at ``speed`` [m/s] together cross at most ``courant_number`` cells
     in each. Sound is sqrt(STIFFENING wave_modulus / density), wave_modulus [Pa] that of the law at rest. Raises
-    MasivError where that is more than the configuration allows."""
+    MasivError if that is more than the configuration allows."""
     crossing = math.sqrt(STIFFENING * max(wave_modulus, 0.0) / density) + speed
     count = max(1, math.ceil(frame_time * crossing / (config.courant_number * spacing)))
     if count > config.max_substeps_per_frame:

@@ -184,7 +184,7 @@ class TracksRun(Run):
         report.html. Returns the errors of each run."""
         from masiv.identify.twin_over_runs import run_errors, simulated
         from masiv.refine.document import with_scopes
-        from masiv.report.tracks_page import write_page
+        from masiv.report.tracks import write_report
         from masiv.twin.identified import IDENTIFIED_FILE, load_identified
 
         twins = {"before": twin}
@@ -216,15 +216,18 @@ class TracksRun(Run):
         )
         files = [self.path / f"{refine_stem(c, self._conditions[0])}.json" for c in self._conditions]
         refined = [with_scopes(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
-        write_page(self.folder.report, self.tracks, twin, errors, curves, refined)
+        write_report(self.folder.report, self.tracks, twin, errors, curves, refined)
         return errors
 
 
 def refine_stem(condition: str | None, first: str) -> str:
     """Name of the files of ``refine`` without their extension: refine for the ``first`` condition (None: that one),
-    refine.CONDITION for another. A condition is any text: what no file name may hold is percent-encoded, so that no two
-    conditions share a file."""
-    return "refine" if condition is None or condition == first else f"refine.{quote(condition, safe=' ')}"
+    refine.CONDITION for another. A condition is any text: what a file name cannot hold is percent-encoded, and so are
+    dots, so that no two conditions share a file and none has that of a dry run (refine.CONDITION.dry_run)."""
+    if condition is None or condition == first:
+        return "refine"
+    encoded = quote(condition, safe=" ").replace(".", "%2E")
+    return f"refine.{'dry%5Frun' if encoded == 'dry_run' else encoded}"
 
 
 def law_entry(twin: Twin) -> dict[str, Any]:

@@ -79,7 +79,7 @@ class VideoRun(Run):
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
         from masiv.report.numbers import law_text, material_numbers, run_numbers, table
-        from masiv.report.report import write_report
+        from masiv.report.video import write_report
         from masiv.simulation.simulate import simulate
 
         folder, scene = self.folder, self.scene

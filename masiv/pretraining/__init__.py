@@ -1,1 +1,1 @@
-"""Neural laws taught from simulated classical materials: what ``identify`` starts from."""
+"""Neural laws trained on simulated classical materials: what ``identify`` starts from."""

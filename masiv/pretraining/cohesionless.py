@@ -1,10 +1,10 @@
-"""A neural law that is taught what sand does, on strains from everywhere.
+"""A neural law trained to flow as sand does, on strains from everywhere.
 
-One throw shows little of a cone: whether matter flows depends on the ratio of two strains, over decades of both. A law
-taught on the states of a throw alone (as the others are) held no slope at all. So strains are sampled over the lattice
-of the law, more of them near the cone, and the networks learn where the classical law flows and where it does not: at
-least a rate within which a substep loses everything there, at most a rate that no film shows here. What lies between is
-bounded by ``table.lipschitz_envelope``: the steepest law is perfect plasticity, which is what a cone is.
+One rollout shows little of a friction cone: whether matter flows depends on the ratio of two strains, over decades of
+both. So strains are sampled over the lattice of the law, more of them near the cone. The plastic network learns where
+the classical law flows and where it does not: where it flows, a rate of at least ``LOG_RATE_FLOWING``, at which a
+substep loses everything; elsewhere at most ``LOG_RATE_RESTING``, which no observation resolves. Between them the rate
+is bounded by ``table.lipschitz_envelope``: the steepest law is perfect plasticity, which a cone is.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from masiv.materials.neural import LOG_RATE_RANGE, NeuralLaw, strain_invariants
 from masiv.progress import Progress
 
 FLOW_STRAIN = 5e-4
-"""Strain below which the cone is blunt: below the elastic strains of sand that carries itself, 1e-3 to 1e-2."""
+"""Strain [1] below which the cone is rounded: less than elastic strains of sand under its weight, 1e-3 to 1e-2."""
 SAMPLES, BATCH = 60_000, 4096
-LARGEST = 1.2
-"""Logarithm of the largest volume ratio and stretch that are shown."""
-FLOWING, RESTING = 9.5, -3.0
-"""Logarithms of the rates [1/s] to reach and not to exceed: relaxation in a tenth of a millisecond, and in 20 s."""
-LEFT = 0.25
-"""What flows, as -ln of the share that is kept: the lattice begins one node early."""
+"""Strains in all, and in one iteration."""
+MAX_LOG_STRETCH = 1.2
+"""Largest logarithm of volume ratio and stretch among the samples."""
+LOG_RATE_FLOWING, LOG_RATE_RESTING = 9.5, -3.0
+"""Logarithms of rates [1/s]: relaxation within a tenth of a millisecond, and within 20 s."""
+MIN_FLOW = 0.25
+"""-ln of the kept part of a strain from which it counts as flowing; less, but not zero, is left out of the loss."""
 
 
-def teach(truth: ClassicalLaw, dt: float, iterations: int, seed: int, progress: Progress) -> NeuralLaw:
-    """A neural law that flows where ``truth``, a law with a cone, does within a substep of dt [s]; with its moduli at
-    small strains at all strains."""
+def train(truth: ClassicalLaw, dt: float, iterations: int, seed: int, progress: Progress) -> NeuralLaw:
+    """A neural law that flows where ``truth``, a law with a friction cone, does within a substep of dt [s]. Its moduli
+    are those of ``truth`` at small strains, at all strains."""
     shear, bulk = _moduli(truth)
     law = NeuralLaw.of_moduli(shear_modulus=shear, bulk_modulus=bulk, seed=seed)
     with torch.no_grad():
@@ -39,13 +40,13 @@ def teach(truth: ClassicalLaw, dt: float, iterations: int, seed: int, progress: 
     trial = _strains(truth, dt, generator)
     flowed = _flowed(truth, trial, dt)
     features = law.features(strain_invariants(trial), FLOW_STRAIN)
-    flows, unclear = flowed > LEFT, (flowed > 0) & (flowed <= LEFT)
+    flows, unclear = flowed > MIN_FLOW, (flowed > 0) & (flowed <= MIN_FLOW)
     optimiser = torch.optim.Adam(law.plastic.parameters(), lr=5e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, iterations, eta_min=1e-5)
     for i in range(iterations):
         pick = torch.randint(len(features), (BATCH,), generator=generator)
         rate = LOG_RATE_RANGE * torch.tanh(law.plastic(features[pick]) / LOG_RATE_RANGE)
-        short = torch.where(flows[pick], torch.relu(FLOWING - rate), torch.relu(rate - RESTING))
+        short = torch.where(flows[pick], torch.relu(LOG_RATE_FLOWING - rate), torch.relu(rate - LOG_RATE_RESTING))
         loss = short.masked_fill(unclear[pick], 0).mean()
         optimiser.zero_grad()
         loss.backward()
@@ -67,13 +68,13 @@ def _moduli(truth: ClassicalLaw) -> tuple[float, float]:
 
 @torch.no_grad()
 def _strains(truth: ClassicalLaw, dt: float, generator: torch.Generator) -> torch.Tensor:
-    """Deformation gradients (SAMPLES, 3, 3): volume and shear uniform over the law's features; for more than half, a
-    compression and a shear within a factor of two or so of what ``truth`` keeps there."""
+    """Deformation gradients (SAMPLES, 3, 3): volume and shear are uniform over the law's features. In 60 % of them, the
+    shear is within a factor of about two of what ``truth`` keeps under their compression."""
 
     def uniform() -> torch.Tensor:
         return torch.rand(SAMPLES, generator=generator)
 
-    volume = (FLOW_STRAIN * torch.sinh(12 * uniform() - 6)).clamp(-LARGEST, LARGEST)
+    volume = (FLOW_STRAIN * torch.sinh(12 * uniform() - 6)).clamp(-MAX_LOG_STRETCH, MAX_LOG_STRETCH)
     shear = 0.5 * FLOW_STRAIN * torch.sqrt(torch.expm1(16 * uniform()))
     near = uniform() < 0.6
     volume = torch.where(near, -volume.abs(), volume)
@@ -83,7 +84,7 @@ def _strains(truth: ClassicalLaw, dt: float, generator: torch.Generator) -> torc
     far = torch.diag_embed(torch.exp(way + volume[:, None] / 3))
     kept = _logs(truth.project(far, dt))[1]
     spread = torch.exp(0.6 * torch.randn(SAMPLES, generator=generator))
-    shear = torch.where(near, kept * spread, shear).clamp(max=LARGEST)
+    shear = torch.where(near, kept * spread, shear).clamp(max=MAX_LOG_STRETCH)
     return torch.diag_embed(torch.exp(shear[:, None] * way + volume[:, None] / 3))
 
 

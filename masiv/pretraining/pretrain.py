@@ -1,8 +1,8 @@
-"""Initial laws: a neural law taught from the full state of one simulated throw of a classical material (as NCLaw does).
+"""Initial laws: a neural law trained on the full state of one simulated rollout of a classical material (as in NCLaw).
 
-Two phases. The pointwise states of the throw (trial gradient, elastic gradient, stress) are fitted first; then the law
-is rolled out from true states, in segments that grow, and the positions are compared (teacher forcing, Ma et al. 2023,
-section 4). Sand is taught otherwise: see ``cohesionless``.
+Two phases. First the pointwise states of the rollout (trial gradient, elastic gradient, stress) are fitted. Then the
+law is rolled out from true states, in segments that grow, and the positions are compared (teacher forcing, Ma et al.
+2023, section 4). Sand is trained in another way: see ``cohesionless``.
 """
 
 from __future__ import annotations
@@ -23,17 +23,20 @@ from masiv.mpm.state import State
 from masiv.pretraining import cohesionless
 from masiv.progress import Progress, silent
 
-# Parameters of NCLaw's throws (notes of its experiments: E, nu, yield stress, friction angle); jelly is neo-Hookean
-# here.
 MATERIALS = {
     "jelly": ("neo_hookean", {"youngs_modulus": 1e5, "poissons_ratio": 0.2}),
     "plasticine": ("von_mises", {"youngs_modulus": 3e5, "poissons_ratio": 0.25, "yield_stress": 5e3}),
     "sand": ("drucker_prager", {"youngs_modulus": 1e6, "poissons_ratio": 0.2, "friction_angle": 25.0}),
     "water": ("water", {"youngs_modulus": 1e5, "poissons_ratio": 0.3}),
 }
-CONE = "drucker_prager"
-SIDE, PER_SIDE, STEPS, DT = 0.5, 10, 1000, 5e-4
+"""Classical law of each material, with the parameters of NCLaw's rollouts; jelly is neo-Hookean here."""
+SIDE, PER_SIDE = 0.5, 10
+"""Side of the cube [m], and particles along it."""
+STEPS, DT = 1000, 5e-4
+"""Substeps of the rollout, each of DT [s]."""
 VELOCITY, OMEGA = (1.0, -1.5, -2.0), (4.0, 4.0, 4.0)
+"""Of the cube at the start [m/s], [rad/s]."""
+MODULUS_WEIGHT = 1e-3
 
 
 def pretrained_path(material: str) -> Path:
@@ -47,8 +50,8 @@ def pretrained_path(material: str) -> Path:
 
 
 @dataclass(frozen=True)
-class Throw:
-    """The full state of a simulated throw: states[k] before substep k, and what the true law made of it."""
+class TrainingRollout:
+    """States[k] of a simulated body before substep k, and what the true law made of each."""
 
     states: list[State]
     gradients: torch.Tensor  # (K, N, 3, 3) after the return mapping
@@ -62,8 +65,8 @@ def simulator(count: int = PER_SIDE**3) -> Simulator:
     )  # fmt: skip
 
 
-def throw(material: str) -> Throw:
-    """Simulate the throw of ``material``: a cube, spinning, onto a frictionless floor."""
+def training_rollout(material: str) -> TrainingRollout:
+    """A cube of ``material`` that falls, spinning, onto a frictionless floor."""
     kind, parameters = MATERIALS[material]
     law = ClassicalLaw(kind, **parameters)
     axis = (torch.arange(PER_SIDE) + 0.5) / PER_SIDE * SIDE
@@ -78,7 +81,7 @@ def throw(material: str) -> Throw:
     trials = torch.stack([s.trial_gradient for s in states]).double()
     gradients = torch.stack([law.project(f, DT) for f in trials])
     stresses = torch.stack([law.stress(f) for f in gradients])
-    return Throw(states, gradients.float().detach(), stresses.float().detach())
+    return TrainingRollout(states, gradients.float().detach(), stresses.float().detach())
 
 
 def pretrain(
@@ -93,9 +96,9 @@ def pretrain(
     if material not in MATERIALS:
         raise InputError(f"unknown material '{material}': use one of {', '.join(MATERIALS)}")
     kind, parameters = MATERIALS[material]
-    truth = throw(material)
-    if kind == CONE:
-        law = cohesionless.teach(ClassicalLaw(kind, **parameters), DT, pointwise // 2, seed, progress)
+    truth = training_rollout(material)
+    if kind == "drucker_prager":
+        law = cohesionless.train(ClassicalLaw(kind, **parameters), DT, pointwise // 2, seed, progress)
         return law, _quality(law, truth)
     law = NeuralLaw(stress_scale=ClassicalLaw(kind, **parameters).wave_modulus() / 2, seed=seed)
     strain = strain_invariants(torch.cat([state.trial_gradient for state in truth.states[::10]]))
@@ -106,7 +109,7 @@ def pretrain(
     return law, _quality(law, truth)
 
 
-def _fit_pointwise(law: NeuralLaw, truth: Throw, iterations: int, seed: int, progress: Progress) -> None:
+def _fit_pointwise(law: NeuralLaw, truth: TrainingRollout, iterations: int, seed: int, progress: Progress) -> None:
     trial = torch.stack([s.trial_gradient for s in truth.states])
     flowed = (truth.gradients @ truth.gradients.mT - trial @ trial.mT).pow(2).mean().sqrt().clamp_min(1e-5)
     stress_scale = truth.stresses.pow(2).mean().sqrt()
@@ -117,13 +120,11 @@ def _fit_pointwise(law: NeuralLaw, truth: Throw, iterations: int, seed: int, pro
         pick = torch.randint(len(flat[0]), (2048,), generator=torch.Generator().manual_seed(seed * 1_000_003 + i))
         f_trial, f, tau = (a[pick] for a in flat)
         out = law.project(f_trial, DT)
-        stress_error = _soft(((law.stress(f) - tau) / stress_scale).flatten(1))
-        flow_error = _soft(((out @ out.mT - f @ f.mT) / flowed).flatten(1))
-        # What the flow erases at once has no modulus to learn: let it be small, or it would set the substep.
-        identifiability_issue = (
-            1e-3 * (law.moduli(strain_invariants(f))[:, :2] / law.log_stress_scale.detach().exp()).mean()
-        )
-        loss = stress_error + flow_error + identifiability_issue
+        stress_error = _mean_norm(((law.stress(f) - tau) / stress_scale).flatten(1))
+        flow_error = _mean_norm(((out @ out.mT - f @ f.mT) / flowed).flatten(1))
+        # A modulus of strain that flows at once cannot be learnt: keep it small, since it would set the substep.
+        shear = (law.moduli(strain_invariants(f))[:, :2] / law.log_stress_scale.detach().exp()).mean()
+        loss = stress_error + flow_error + MODULUS_WEIGHT * shear
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -132,17 +133,17 @@ def _fit_pointwise(law: NeuralLaw, truth: Throw, iterations: int, seed: int, pro
             progress("pointwise", i + 1, iterations, f"loss {float(loss.detach()):.3g}")
 
 
-def _soft(error: torch.Tensor) -> torch.Tensor:
-    """Mean norm: near a yield surface the squared error is all in a few particles."""
+def _mean_norm(error: torch.Tensor) -> torch.Tensor:
+    """Mean norm of (N, K): robust, since near a yield surface the square error is all in a few particles."""
     return (error.pow(2).sum(1) + 1e-6).sqrt().mean()
 
 
-def _fit_rollouts(law: NeuralLaw, truth: Throw, epochs: int, progress: Progress) -> None:
+def _fit_rollouts(law: NeuralLaw, truth: TrainingRollout, epochs: int, progress: Progress) -> None:
     sim = simulator()
     optimiser = torch.optim.Adam(law.parameters(), lr=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(epochs, 1), eta_min=1e-5)
     for epoch in range(epochs):
-        # Segment length on a cosine from 25 to 200 substeps, as NCLaw's teacher.
+        # The segments grow from 25 to 200 substeps along a cosine, as in NCLaw.
         length = round(200 - 175 * 0.5 * (1 + math.cos(math.pi * epoch / epochs)))
         optimiser.zero_grad()
         total = 0.0
@@ -157,7 +158,7 @@ def _fit_rollouts(law: NeuralLaw, truth: Throw, epochs: int, progress: Progress)
         progress("rollouts", epoch + 1, epochs, f"mean error {1e3 * total:.2f} mm over {length} substeps")
 
 
-def _segment_loss(law: NeuralLaw, sim: Simulator, truth: Throw, start: int, length: int) -> torch.Tensor:
+def _segment_loss(law: NeuralLaw, sim: Simulator, truth: TrainingRollout, start: int, length: int) -> torch.Tensor:
     outputs = list(range(5, length + 1, 5))
     motion = rollout(sim, law, truth.states[start], length, outputs)
     target = torch.stack([truth.states[start + k].position for k in outputs])
@@ -165,7 +166,7 @@ def _segment_loss(law: NeuralLaw, sim: Simulator, truth: Throw, start: int, leng
 
 
 @torch.no_grad()
-def _quality(law: NeuralLaw, truth: Throw) -> dict[str, float]:
+def _quality(law: NeuralLaw, truth: TrainingRollout) -> dict[str, float]:
     trial = torch.stack([s.trial_gradient for s in truth.states]).flatten(0, 1)
     gradients, stresses = truth.gradients.flatten(0, 1), truth.stresses.flatten(0, 1)
     out = law.project(trial, DT)

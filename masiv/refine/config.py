@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pydantic import BaseModel, ConfigDict, Field
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-
-FORMER_NAMES = {
+RENAMED_KEYS = {
     "above_noise": "noise_threshold",
     "unexplained": "max_reduced_chi",
     "least_explained": "min_explained",
@@ -21,7 +19,7 @@ FORMER_NAMES = {
     "confusable": "confusable_correlation",
     "second_look": "search_second_effect",
 }
-"""Keys as run folders of earlier versions have them."""
+"""Keys of earlier versions: old name -> new name."""
 
 
 class RefineConfig(BaseModel):
@@ -105,12 +103,3 @@ class RefineConfig(BaseModel):
     confusable_correlation: float = Field(
         0.95, gt=0, le=1, description="correlation of two patterns above which two effects are confusable"
     )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _read_former_names(cls, given: Any) -> Any:
-        if not isinstance(given, dict):
-            return given
-        return {FORMER_NAMES[k]: v for k, v in given.items() if k in FORMER_NAMES} | {
-            k: v for k, v in given.items() if k not in FORMER_NAMES
-        }

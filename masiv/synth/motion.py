@@ -23,8 +23,8 @@ _NEIGHBOURS = 16
 def simulate(spec: SynthSpec, body: Solid) -> np.ndarray:
     """Positions (T, N, 3) float32 [m] of the body's particles at every frame.
 
-    Frame 0 is the start, whatever effects say of the clock. Needs ``masiv.runtime.start``. Raises InputError for an
-    unusable law or effect, NonFiniteError where the simulation blows up.
+    Frame 0 is the start, even if a clock effect acts. Needs ``masiv.runtime.start``. Raises InputError for an unusable
+    law or effect, NonFiniteError if the simulation diverges.
     """
     import torch
 
@@ -119,7 +119,7 @@ class Skin:
         self.arm = vertices - self.middle
         self.offsets = around - self.middle[:, None]
         inertia = np.einsum("vk,vki,vkj->vij", self.weight, self.offsets, self.offsets)
-        # A sheet of neighbours says nothing across itself: the added trace keeps the map finite there.
+        # A sheet of neighbours does not determine the map across it: the added trace keeps it finite.
         inertia += 1e-3 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         self.inverse = np.linalg.inv(inertia)
         self.slack = np.eye(3) - np.einsum("vk,vki,vkj,vjl->vil", self.weight, self.offsets, self.offsets, self.inverse)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from masiv.scene.camera import Camera
-from masiv.synth.texture import ground_colour, solid_colour
+from masiv.synth.texture import ground_color, solid_color
 
 _SUN = np.array([0.45, 0.8, 0.4]) / np.linalg.norm([0.45, 0.8, 0.4])
 _AMBIENT, _DIRECT, _SHADOW = 0.62, 0.5, 0.55
@@ -31,7 +31,7 @@ def picture(
 
     ``empty`` is the ``background`` of the camera, ``supersampling`` times as large.
     """
-    fine = enlarged(camera, supersampling)
+    fine = enlarged_camera(camera, supersampling)
     image = empty.copy()
     shown = np.zeros((fine.height, fine.width), np.float32)
     if surface is not None:
@@ -44,7 +44,7 @@ def picture(
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
         light = _AMBIENT * (0.75 + 0.25 * normal[:, 1]) + _DIRECT * np.clip(normal @ _SUN, 0, None)
-        image[hit] = solid_colour(texture, local, seed) * light[:, None]
+        image[hit] = solid_color(texture, local, seed) * light[:, None]
         shown[hit] = 1
     size = (camera.width, camera.height)
     return (
@@ -70,7 +70,7 @@ def rasterise(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> tuple[
     low = np.floor(corner.min(axis=1) - 0.5).astype(int).clip(0)
     high = np.ceil(corner.max(axis=1) + 0.5).astype(int)
     high = np.minimum(high, [camera.width, camera.height])
-    # Counter-clockwise from outside is clockwise where y points down: a negative area faces the camera.
+    # Counter-clockwise from outside is clockwise if y points down: a negative area faces the camera.
     drawn = (depth[faces] > 1e-3).all(axis=1) & (area < -1e-9) & (high > low).all(axis=1)
     reach = (high - low).max(axis=1)
     for size in 2 ** np.arange(1, int(np.log2(max(camera.width, camera.height))) + 2):
@@ -101,7 +101,7 @@ def rasterise(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> tuple[
     return face.reshape(shape), bary.reshape(*shape, 3)
 
 
-def enlarged(camera: Camera, factor: int) -> Camera:
+def enlarged_camera(camera: Camera, factor: int) -> Camera:
     """The camera with ``factor`` times as many pixels along each side."""
     intrinsics = camera.intrinsics * np.array([[factor], [factor], [1.0]])
     return Camera(camera.name, camera.width * factor, camera.height * factor, intrinsics, camera.world_to_camera)
@@ -117,7 +117,7 @@ def background(camera: Camera, seed: int) -> np.ndarray:
     along = camera.centre[1] / -rays[down][:, 1]
     points = camera.centre + along[:, None] * rays[down]
     haze = np.exp(-np.linalg.norm(points[:, [0, 2]], axis=1) / 12.0)[:, None]
-    image[down] = haze * ground_colour(points, seed) + (1 - haze) * _SKY
+    image[down] = haze * ground_color(points, seed) + (1 - haze) * _SKY
     return image
 
 

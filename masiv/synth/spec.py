@@ -27,7 +27,7 @@ class MaterialSpec(_Part):
 
 
 class CameraSpec(_Part):
-    """Cameras evenly round the body, at heights that alternate."""
+    """Cameras evenly around the body, at alternating heights."""
 
     count: int = Field(11, ge=2, le=200)
     size: int = Field(128, ge=16, le=2048, description="side of the square pictures [pixels]")
@@ -40,19 +40,19 @@ class CameraSpec(_Part):
 class SynthSpec(_Part):
     """A synthetic multi-view scene: y up, ground at y = 0."""
 
-    shape: ShapeSpec = ShapeSpec()
-    material: MaterialSpec = MaterialSpec()
+    shape: ShapeSpec = ShapeSpec.model_validate({})
+    material: MaterialSpec = MaterialSpec.model_validate({})
     velocity: Vector = Field((0, 0, 0), description="of the centre at frame 0 [m/s]")
     omega: Vector = Field((0, 0, 0), description="spin at frame 0 [rad/s]")
     gravity: Vector = Field((0, -9.8, 0), description="[m/s^2]")
     contact: Literal["sticky", "release", "slip"] = "sticky"
     friction: float = Field(0.0, ge=0, description="Coulomb's coefficient of contact slip")
     effects: dict[str, dict[str, float]] = Field(
-        {}, description="of masiv.effects, by name, with their parameters: simulated, but told only in truth.yaml"
+        {}, description="of masiv.effects, by name, with their parameters: simulated, but declared only in truth.yaml"
     )
     frames: int = Field(12, ge=2)
     fps: float = Field(24.0, gt=0)
-    cameras: CameraSpec = CameraSpec()
+    cameras: CameraSpec = CameraSpec.model_validate({})
     texture: Literal["noise", "stripes", "patches"] = "noise"
     image_noise: float = Field(1.5, ge=0, description="standard deviation, of 255")
     supersampling: Annotated[int, Field(ge=1, le=8)] = 3
@@ -62,7 +62,7 @@ class SynthSpec(_Part):
 
 
 def read_spec(path: Path) -> SynthSpec:
-    """The spec in a YAML file. Raises InputError, naming the nearest known key, where something is wrong with it."""
+    """The spec in a YAML file. Raises InputError, with the nearest known key, if something is wrong with it."""
     spec = validated(SynthSpec, read_yaml(path), str(path))
     mesh = spec.shape.mesh
     if mesh is None:

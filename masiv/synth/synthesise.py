@@ -16,7 +16,7 @@ from masiv.progress import Progress, silent
 from masiv.scene.camera import Camera
 from masiv.shapes import make_body
 from masiv.synth.motion import Skin, simulate
-from masiv.synth.picture import Surface, background, enlarged, picture
+from masiv.synth.picture import Surface, background, enlarged_camera, picture
 from masiv.synth.spec import CameraSpec, SynthSpec
 
 _SMALL = [cv2.IMWRITE_PNG_COMPRESSION, 9]
@@ -25,8 +25,8 @@ _SMALL = [cv2.IMWRITE_PNG_COMPRESSION, 9]
 def synthesise(spec: SynthSpec, out: Path, *, progress: Progress = silent) -> None:
     """Simulate and film ``spec`` into the new folder ``out``, complete or not at all. Needs ``masiv.runtime.start``.
 
-    The spec is in ``truth.yaml``, with its undeclared effects, of which nothing else in ``out`` tells. Raises
-    InputError where ``out`` holds something already, or for an unusable mesh, law or effect.
+    The spec with its undeclared effects is in ``truth.yaml``, and nowhere else in ``out``. Raises InputError if ``out``
+    is not empty, or for an unusable mesh, law or effect.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} holds something already: give --out a new folder")
@@ -44,7 +44,7 @@ def synthesise(spec: SynthSpec, out: Path, *, progress: Progress = silent) -> No
         np.save(draft / "gt" / f"particles_{frame}.npy", motion[frame, np.sort(kept)])
     cameras = ring(spec.cameras)
     skin = Skin(body.vertices, body.particles)
-    empty = [background(enlarged(camera, spec.supersampling), spec.seed) for camera in cameras]
+    empty = [background(enlarged_camera(camera, spec.supersampling), spec.seed) for camera in cameras]
     listing = []
     for done, frame in enumerate(range(-1, spec.frames)):
         surface = None

@@ -1,0 +1,36 @@
+"""States of a stage that is done in parts."""
+
+from __future__ import annotations
+
+import torch
+
+from masiv.checkpoint import Checkpoint, NestedCheckpoint
+
+
+def test_a_nested_state_holds_the_results_of_earlier_parts(tmp_path):
+    stage = Checkpoint(tmp_path / "stage.pt", every_s=0.0)
+    part = NestedCheckpoint(stage, {"first": torch.ones(2)})
+    inner = NestedCheckpoint(part, {"second": 2})
+    inner.maybe_save(lambda: {"step": 3})
+    state = stage.load()
+    assert state is not None
+    assert state.keys() == {"first", "second", "step"}
+    assert torch.equal(state["first"], torch.ones(2))
+    part.save({})
+    assert inner.load() is not None
+    assert inner.load().keys() == {"first"}
+
+
+def test_a_saved_key_takes_the_place_of_a_fixed_one(tmp_path):
+    """As when a part is resumed and everything that was saved is fixed."""
+    stage = Checkpoint(tmp_path / "stage.pt")
+    stage.save({"base": 1, "fit": 2})
+    NestedCheckpoint(stage, stage.load() or {}).save({"fit": 3})
+    assert stage.load() == {"base": 1, "fit": 3}
+
+
+def test_without_a_path_nothing_is_kept():
+    part = NestedCheckpoint(Checkpoint(None, every_s=0.0), {"first": 1})
+    part.maybe_save(lambda: {"step": 1})
+    part.save({"step": 2})
+    assert part.load() is None
