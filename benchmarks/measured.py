@@ -128,7 +128,7 @@ def balls(source: Path) -> dict:
         "one drag coefficient for all": _held(simulation, first, "quadratic_drag"),
         "one gravity for all": _held(simulation, first, "gravity_scale"),
     }
-    each = simulation.made("gravity_scale", simulation.bodies, each=True)
+    each = simulation.scoped_term("gravity_scale", simulation.bodies, each=True)
     start = {p.name: -0.1 for p in each.parameters} | result.before.values
     model = Model(result.before.model.family, "none", (each.name,))
     trap = gauss_newton_fit(simulation, model, start, budget=20 * (len(start) + 1))

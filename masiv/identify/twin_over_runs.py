@@ -42,7 +42,7 @@ def simulate_runs(
     group = group_of(tracks)
     if group is not None:
         points = PointMassModel(tracks, flight_observations(tracks, group))
-        terms = [(e, points.made(e.name, e.bodies).name) for e in twin.effects]
+        terms = [(e, points.scoped_term(e.name, e.bodies).name) for e in twin.effects]
         values = {n: v for e, term in terms for n, v in effect_values(e, term).items()}
         return TwinSimulation(
             points, Model(RIGID, "none", tuple(term for _, term in terms)), {**start_values(twin), **values}

@@ -85,8 +85,8 @@ class PointMassModel(ForwardModel):
         of_effects = [p for name in model.effects for p in self.term(name).parameters]
         return (*own, *(p for p in of_effects if p.name not in self.known))
 
-    def alone(self, body: str, model: Model, values: Mapping[str, float]) -> PointMassModel:
-        """The runs of one body. The effects of ``model`` act as ``values`` say."""
+    def single_body(self, body: str, model: Model, values: Mapping[str, float]) -> PointMassModel:
+        """A model of the runs of ``body`` alone. The effects of ``model`` act with ``values``, which are not fitted."""
         known = {p.name: values[p.name] for name in model.effects for p in self.term(name).parameters}
         runs = [run for run in self.observations if run.body == body]
         made = PointMassModel(self.tracks, runs, {**self.known, **known}, self.substep)
@@ -94,28 +94,29 @@ class PointMassModel(ForwardModel):
         return made
 
     def candidates(self, model: Model) -> list[str]:
-        """Effects of the surroundings once; those that depend on the body once for all, and once a body."""
+        """Effects of the surroundings, one term each; of those that differ by body, a term for all bodies, one for each
+        body and one with a strength of its own for each. What acts at a place is left out: a point passes it once."""
         out, taken = [], [self.term(name) for name in model.effects]
         for name, effect in causes().items():
             at_place = any(p.unit == "m" for p in effect.parameters[effect.strengths :])
             if at_place or not isinstance(effect, NodalEffect):
-                continue  # what acts at a place is not told by a point that passes it once
+                continue
             has = [t for t in taken if t.effect == name]
             if not has:
-                out.append(self.made(name, ()).name)
+                out.append(self.scoped_term(name, ()).name)
             differs = effect.per_body is not None and effect.per_body.differs_by_body
             if differs and len(self.bodies) > 1 and all(t.bodies for t in has):
                 held = {b for t in has for b in t.bodies}
                 fitted = {run.body for run in self.observations if run.fitted}
                 alone = [b for b in self.bodies if b not in held and b in fitted]
-                out += [self.made(name, (b,)).name for b in alone]
+                out += [self.scoped_term(name, (b,)).name for b in alone]
                 if len(alone) > 1:
-                    out.append(self.made(name, tuple(alone), each=True).name)
+                    out.append(self.scoped_term(name, tuple(alone), each=True).name)
         return out
 
-    def made(self, effect: str, bodies: tuple[str, ...], *, each: bool = False) -> EffectTerm:
-        """``effect`` on ``bodies`` alone, all with the same strength or ``each`` with its own; on all, with the same,
-        where none are given."""
+    def scoped_term(self, effect: str, bodies: tuple[str, ...], *, each: bool = False) -> EffectTerm:
+        """The term of ``effect`` on ``bodies``, with one strength or, if ``each``, one strength a body. On all bodies
+        with one strength if ``bodies`` is empty. Raises InputError for an unknown effect."""
         known = effect_named(effect)
         scope = "+".join(bodies)
         if each:
@@ -137,13 +138,13 @@ class PointMassModel(ForwardModel):
             self.terms[name] = EffectTerm(name, effect, tuple(made[:cut]), tuple(made[cut:]), guesses, units, bodies)
         return self.terms[name]
 
-    def own(self, term: EffectTerm, body: str) -> tuple[Parameter, ...]:
+    def parameters_of(self, term: EffectTerm, body: str) -> tuple[Parameter, ...]:
         """The parameters of ``term`` for one of its bodies."""
         return tuple(p for p in term.parameters if " of " not in p.name or p.name.endswith(f" of {body}"))
 
     def term(self, name: str) -> EffectTerm:
-        """A term that ``candidates`` or ``made`` gave, or an effect of all."""
-        return self.terms[name] if name in self.terms else self.made(name, ())
+        """A term that ``candidates`` or ``scoped_term`` has returned, or an effect on all bodies."""
+        return self.terms[name] if name in self.terms else self.scoped_term(name, ())
 
     def _context(self, run: TracksObservation) -> EffectContext:
         body = self.drag_bodies[run.body]
@@ -161,7 +162,9 @@ class PointMassModel(ForwardModel):
             effect, theta = effect_named(name), None
             for term in (self.term(n) for n in model.effects):
                 if term.effect == name and (not term.bodies or run.body in term.bodies):
-                    given = torch.tensor([values[p.name] for p in self.own(term, run.body)], dtype=torch.float64)
+                    given = torch.tensor(
+                        [values[p.name] for p in self.parameters_of(term, run.body)], dtype=torch.float64
+                    )
                     theta = effect.per_body.of_body(given, self.drag_bodies[run.body]) if effect.per_body else given
             if theta is None:
                 absent = [0.0 if k < effect.strengths else p.start for k, p in enumerate(effect.parameters)]
@@ -234,7 +237,7 @@ class PointMassModel(ForwardModel):
 
     def _impossible(self, fitted: FittedModel, term: EffectTerm, body: str) -> str | None:
         """What the medium cannot do to ``body``."""
-        theta = torch.tensor([fitted.values[p.name] for p in self.own(term, body)], dtype=torch.float64)
+        theta = torch.tensor([fitted.values[p.name] for p in self.parameters_of(term, body)], dtype=torch.float64)
         per_body = effect_named(term.effect).per_body
         return per_body.violates_bounds(theta, self.drag_bodies[body]) if per_body else None
 

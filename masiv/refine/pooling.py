@@ -73,11 +73,11 @@ class _Pool:
         others = Model(after.model.family, "none", tuple(n for n in after.model.effects if n != term.name))
         kept, values, stderr = [], dict(after.values), {}
         for body in term.bodies:
-            own = model.made(term.effect, (body,))
+            own = model.scoped_term(term.effect, (body,))
             # Not from zero: a fit that begins on a bound hardly leaves it.
             start = {
                 p.name: max(after.values[q.name], p.step)
-                for p, q in zip(own.parameters, model.own(term, body), strict=True)
+                for p, q in zip(own.parameters, model.parameters_of(term, body), strict=True)
             }
             single = self._fit_single_body(body, others, {**after.values, **start}, own)
             if isinstance(single, ModelFit):
@@ -95,7 +95,7 @@ class _Pool:
         self, body: str, others: Model, values: Mapping[str, float], own: EffectTerm
     ) -> ModelFit | tuple[str, ...]:
         """The fit of ``own`` to the flights of ``body`` alone, or the objections to it."""
-        one = self.forward_model.alone(body, others, values)
+        one = self.forward_model.single_body(body, others, values)
         try:
             without = fit_flights(one, others, values)
             fitted = fit_flights(one, others.with_effect(own.name), values)
@@ -126,7 +126,7 @@ class _Pool:
 
     def _with_one_strength(self, effect: str, parts: list[EffectTerm]) -> SharedFit:
         model, after = self.forward_model, self.search.after
-        one = model.made(effect, tuple(b for t in parts for b in t.bodies))
+        one = model.scoped_term(effect, tuple(b for t in parts for b in t.bodies))
         kept = tuple(n for n in after.model.effects if model.term(n) not in parts)
         start = {
             p.name: float(np.mean([after.values[q.parameters[k].name] for q in parts]))
