@@ -37,7 +37,7 @@ from masiv.refine.from_tracks import refine_tracks
 from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import refine
 from masiv.refine.to_twin import refined_twin
-from masiv.simulation.fitted_twin import fitted_twin, place_of
+from masiv.simulation.fitted_twin import fitted_twin, law_values, place_of
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.read import read_tracks
 
@@ -178,7 +178,7 @@ def test_one_body_from_its_law_to_its_twin(bar, tmp_path):
     assert (again.forward_model.rollouts, again.after.values) == (0, result.after.values)
     refined = refined_twin(twin, result)
     assert [(e.name, e.condition) for e in refined.effects] == [("viscosity", None)]
-    assert refined.law.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.02)
+    assert law_values(refined)["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.02)
     assert twin.effects == ()
     load = config.model_copy(update={"refine": RefineConfig.model_validate({"effects": ["gravity_scale"]})})
     other = refine_tracks(bar, refined, load, condition="load", dry_run=True)
@@ -210,7 +210,7 @@ def test_a_place_is_told_in_the_body(bar):
     run = simulation.observations[0]
     tip = np.array([0.0, 0.0, 0.05])  # own axes
     placement = next(r for r in bar.runs if r.name == run.name).placement
-    x, y, z = run.body.frame.points_to_simulation(placement.to_world(tip[None]))[0]
+    x, y, z = simulation.body(run).axes.points_to_simulation(placement.to_world(tip[None]))[0]
     values = {"point_mass.x": float(x), "point_mass.y": float(y), "point_mass.z": float(z)}
     fitted: Any = SimpleNamespace(values=values)
     assert place_of(simulation, "point_mass", fitted) == pytest.approx(tuple(tip), abs=1e-9)

@@ -3,24 +3,40 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol
 
 from masiv import runtime
-from masiv.config import Config
 from masiv.errors import InputError, MasivError
+from masiv.identify.config import IdentifyConfig
 from masiv.identify.flights import fit_flights
 from masiv.identify.tracks import conditions, fit_law, only_body, ratio_of, simulation_of
 from masiv.inference.model_fit import ModelFit, rank_by_bic
 from masiv.models.families import FAMILIES, family_of
 from masiv.models.point_mass import PointMassModel
+from masiv.mpm.config import SimulatorConfig
 from masiv.observations.tracks import flight_observations
 from masiv.progress import Progress, silent
 from masiv.simulation.fitted_twin import fitted_twin
+from masiv.tracks.config import TracksConfig
 from masiv.tracks.tracks import Tracks
 from masiv.twin import Twin
 from masiv.twin.from_tracks import twin_of_tracks
 
 AUTO = ("neo_hookean", "von_mises")
 """Laws that compete if none is named."""
+
+
+class TracksSettings(Protocol):
+    """The sections of the configuration that concern the law of a scene of tracks."""
+
+    @property
+    def identify(self) -> IdentifyConfig: ...
+
+    @property
+    def tracks(self) -> TracksConfig: ...
+
+    @property
+    def simulator(self) -> SimulatorConfig: ...
 
 
 def group_of(tracks: Tracks) -> str | None:
@@ -35,7 +51,7 @@ def group_of(tracks: Tracks) -> str | None:
 
 
 def identify_tracks(
-    tracks: Tracks, config: Config, *, folder: Path | None = None, progress: Progress = silent
+    tracks: Tracks, config: TracksSettings, *, folder: Path | None = None, progress: Progress = silent
 ) -> tuple[Twin, list[ModelFit]]:
     """The law that explains the runs of the first condition best, and the fits that competed, best first.
 
@@ -57,12 +73,12 @@ def identify_tracks(
         return fitted_twin(described, best, forward_model, errors_mm(best)), fits
 
 
-def described_twin(tracks: Tracks, config: Config) -> Twin:
+def described_twin(tracks: Tracks, config: TracksSettings) -> Twin:
     """What the scene says of its bodies and of how they start, without what is fitted. Raises InputError."""
     return twin_of_tracks(tracks, config.tracks, config.simulator, rigid=group_of(tracks) is not None)
 
 
-def _fit_laws(tracks: Tracks, config: Config, folder: Path | None, progress: Progress) -> list[ModelFit]:
+def _fit_laws(tracks: Tracks, config: TracksSettings, folder: Path | None, progress: Progress) -> list[ModelFit]:
     """Fits of the laws that compete, best first."""
     body, condition = only_body(tracks), conditions(tracks)[0]
     fits: list[ModelFit] = []
@@ -81,7 +97,7 @@ def _fit_laws(tracks: Tracks, config: Config, folder: Path | None, progress: Pro
     return rank_by_bic(fits)
 
 
-def _known(tracks: Tracks, config: Config, kind: str) -> dict[str, float]:
+def _known(tracks: Tracks, config: TracksSettings, kind: str) -> dict[str, float]:
     """Poisson's ratio as the scene declares it, if the law ``kind`` has one."""
     has_ratio = "poissons_ratio" in {p.name for p in FAMILIES[kind].parameters}
     return ratio_of(only_body(tracks), config.tracks) if has_ratio else {}

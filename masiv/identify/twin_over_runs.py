@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from masiv.config import Config
-from masiv.identify.from_tracks import group_of
+from masiv.identify.from_tracks import TracksSettings, group_of
 from masiv.identify.tracks import only_body, simulation_of
 from masiv.models.base import Model
 from masiv.models.clamped_body import ClampedBodyModel
@@ -34,7 +33,7 @@ class TwinSimulation:
         return self.simulation.fields(self.model, self.values, held_out=True)
 
 
-def simulated(tracks: Tracks, twin: Twin, config: Config, condition: str | None = None) -> TwinSimulation:
+def simulated(tracks: Tracks, twin: Twin, config: TracksSettings, condition: str | None = None) -> TwinSimulation:
     """``twin`` over the runs of ``condition`` (None: the first)."""
     group = group_of(tracks)
     if group is not None:

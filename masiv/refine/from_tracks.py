@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 from masiv import runtime
-from masiv.config import Config
 from masiv.errors import InputError
-from masiv.identify.from_tracks import group_of
+from masiv.identify.from_tracks import TracksSettings, group_of
 from masiv.identify.tracks import conditions, only_body, runs_of, simulation_of
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
@@ -38,8 +38,15 @@ NOT_FOR_TRACKS = {
 """Keys of refine that say nothing of tracks, and what holds for these."""
 
 
+class RefineTracksSettings(TracksSettings, Protocol):
+    """The sections of the configuration that concern refine of a scene of tracks."""
+
+    @property
+    def refine(self) -> RefineConfig: ...
+
+
 def refine_tracks(
-    tracks: Tracks, twin: Twin, config: Config, *, condition: str | None = None, dry_run: bool = False,
+    tracks: Tracks, twin: Twin, config: RefineTracksSettings, *, condition: str | None = None, dry_run: bool = False,
     folder: Path | None = None, progress: Progress = silent,
 ) -> RefineResult:  # fmt: skip
     """Which effects does the model of the runs lack? Runs with ``use: hold_out`` judge them.
@@ -61,7 +68,7 @@ def refine_tracks(
         return refine_group(tracks, group, settings)
 
 
-def check_config(config: Config) -> None:
+def check_config(config: RefineTracksSettings) -> None:
     """Raises InputError for a setting that says nothing of tracks and is not the default: it would be ignored."""
     default = RefineConfig.model_validate({})
     for key, instead in NOT_FOR_TRACKS.items():
@@ -84,7 +91,7 @@ def refine_group(tracks: Tracks, group: str, settings: SearchSettings) -> Refine
 
 
 def _refine_body(
-    tracks: Tracks, twin: Twin, config: Config, settings: SearchSettings, condition: str | None,
+    tracks: Tracks, twin: Twin, config: RefineTracksSettings, settings: SearchSettings, condition: str | None,
     folder: Path | None,
 ) -> RefineResult:  # fmt: skip
     first = conditions(tracks)[0]
