@@ -16,13 +16,13 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.observations.base import rms_mm
 from masiv.progress import Progress
 from masiv.tracks.config import TracksConfig
-from masiv.tracks.tracks import Body, Run, Tracks
+from masiv.tracks.tracks import Run, TrackedBody, Tracks
 
 STIFFNESSES = 13
 """Values of the law's modulus that the first search tries, between the bounds of its family."""
 
 
-def only_body(tracks: Tracks) -> Body:
+def only_body(tracks: Tracks) -> TrackedBody:
     """The body of a scene that has one. Raises InputError."""
     if len(tracks.bodies) != 1:
         raise InputError(
@@ -65,7 +65,7 @@ def simulation_of(
     return ClampedBodyModel(tracks, runs, known=known, horizons=horizons, folder=folder)
 
 
-def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:
+def ratio_of(body: TrackedBody, config: TracksConfig) -> dict[str, float]:
     """Poisson's ratio, where the scene declares it: no more than what is affordable."""
     if body.poissons_ratio is None:
         return {}

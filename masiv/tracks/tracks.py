@@ -32,7 +32,7 @@ class Clamp:
 
 
 @dataclass(frozen=True)
-class Body:
+class TrackedBody:
     """One object; what is None is not known. density [kg/m³]; mass [kg]; bodies of one ``group`` share the laws of
     their surroundings. Where ``geometry`` and one of density and mass are known, so is the other."""
 
@@ -79,12 +79,12 @@ class Run:
     @property
     def axes(self) -> np.ndarray:
         """Which axes of which marker were measured in any frame, (M, 3) bool."""
-        return np.isfinite(self.positions).any(axis=0)
+        return np.asarray(np.isfinite(self.positions).any(axis=0))
 
     @property
     def seen(self) -> np.ndarray:
         """Frames where a marker has all of its axes, (T, M) bool."""
-        return (np.isfinite(self.positions) | ~self.axes).all(axis=2) & self.axes.any(axis=1)
+        return np.asarray((np.isfinite(self.positions) | ~self.axes).all(axis=2) & self.axes.any(axis=1))
 
     def between(self, start: float, stop: float) -> Run:
         """The frames from ``start`` to ``stop`` [s]; what is known of rest and release stays."""
@@ -146,7 +146,7 @@ class Tracks:
     up: np.ndarray
     gravity: np.ndarray
     ground: Ground | None
-    bodies: dict[str, Body]
+    bodies: dict[str, TrackedBody]
     runs: tuple[Run, ...]
     problems: tuple[str, ...] = ()
     medium_density: float = 1.2
@@ -162,7 +162,7 @@ class Tracks:
             if run.purpose == purpose and body in (None, run.body) and condition in (None, run.condition)
         )
 
-    def groups(self) -> dict[str, tuple[Body, ...]]:
+    def groups(self) -> dict[str, tuple[TrackedBody, ...]]:
         """Bodies by the group in which they share the laws of their surroundings."""
         names = dict.fromkeys(body.group for body in self.bodies.values())
         return {name: tuple(b for b in self.bodies.values() if b.group == name) for name in names}
