@@ -114,9 +114,9 @@ class Listening(Workers):
         super().__init__(1)
         self.heard = []
 
-    def map(self, function, tasks):
+    def map(self, function, tasks, *, shared=()):
         self.heard.append(list(tasks))
-        return super().map(function, self.heard[-1])
+        return super().map(function, self.heard[-1], shared=shared)
 
 
 def test_a_tensor_is_copied_to_a_process_and_its_memory_stays_where_it_is(two):
@@ -227,7 +227,7 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
     listening = Listening()
     alone, beside = (choose_starting_laws(objective, throw, quiet, workers) for workers in (listening, two))
     assert len(alone) == 2
-    efforts = [search_cost(name, modulus) for _, _, name, _, _, modulus in listening.heard[1]]
+    efforts = [search_cost(name, modulus) for name, _, _, modulus in listening.heard[1]]
     assert efforts == sorted(efforts, reverse=True)  # or the longest search may begin last, alone
     for a, b in zip(alone, beside, strict=True):
         assert (a.material, a.contact, a.objective) == (b.material, b.contact, b.objective)

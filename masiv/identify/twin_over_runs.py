@@ -36,7 +36,7 @@ class TwinSimulation:
         return self.simulation.fields(self.model, self.values, held_out=True)
 
 
-def twin_over_runs(
+def simulate_runs(
     tracks: Tracks, twin: Twin, config: TracksConfig, simulator: SimulatorConfig, condition: str | None = None
 ) -> TwinSimulation:
     """``twin`` as a forward model of the runs of ``condition`` (None: the first)."""
