@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from dropped_balls import Ball, write_scene
 from small import SMALL
-from test_tracks_group import Ball, write_scene
 
 from masiv.cli import main
 from masiv.config import Config

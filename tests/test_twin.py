@@ -243,6 +243,12 @@ def drag(**parameters):
             "water",
             r"law.kind' is 'water', but law.safetensors holds a von_mises",
         ),
+        (
+            ("bodies", 0, "law", "parameters", "yield_stress", "value"),
+            90.0,
+            "yield_stress.value' is 90.0, but law.safetensors holds 850",
+        ),
+        (("bodies", 0, "law", "parameters"), {}, "parameters.* is None, but law.safetensors holds"),
         (("bodies", 0, "law", "file"), "../law.safetensors", "'bodies.0.law.file' is '../law.safetensors'"),
         (("bodies", 0, "law", "file"), "none.safetensors", "none.safetensors is not a law"),
         (("bodies", 0, "particles"), None, "'bodies.0.particles' is missing"),
@@ -322,6 +328,19 @@ def test_the_properties_of_one_body_are_refused_for_several():
         _ = replace(twin, bodies=twin.bodies[:1]).law
     with pytest.raises(InputError, match="no initial condition under 'wind': its conditions are '', 'load'"):
         described(rigid=False).in_condition("wind")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda twin: replace(twin, gravity=np.zeros(2)), r"gravity has shape \(2,\), it must be \(3,\)"),
+        (lambda twin: twin.with_motion(velocity=np.zeros((1, 3))), r"velocity in .* has shape \(1, 3\)"),
+        (lambda twin: twin.with_body(particles=np.zeros((3, 4))), r"particles of body .* it must be \(Q, 3\)"),
+    ],
+)
+def test_a_wrong_shape_is_refused_at_once(make, message):
+    with pytest.raises(InputError, match=message):
+        make(Twin.load(SCHEMA1 / "video"))
 
 
 # ---- before and after refine ---------------------------------------------------------------------------------------

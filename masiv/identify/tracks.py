@@ -20,13 +20,13 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.observations.base import rms_mm
 from masiv.progress import Progress
 from masiv.tracks.config import TracksConfig
-from masiv.tracks.tracks import Body, Run, Tracks
+from masiv.tracks.tracks import Run, TrackedBody, Tracks
 
 SEARCHED_MODULI = 13
 """Number of values of the law's modulus that the search tries, between the bounds of its family."""
 
 
-def single_body(tracks: Tracks) -> Body:
+def single_body(tracks: Tracks) -> TrackedBody:
     """The body of a scene with one body. Raises InputError for several."""
     if len(tracks.bodies) != 1:
         raise InputError(
@@ -73,7 +73,7 @@ def clamped_body_model(
     return ClampedBodyModel(tracks, runs, known=known, horizons=horizons, folder=folder)
 
 
-def declared_poissons_ratio(body: Body, config: TracksConfig) -> dict[str, float]:
+def declared_poissons_ratio(body: TrackedBody, config: TracksConfig) -> dict[str, float]:
     """Poisson's ratio if the scene declares it; at most ``config.max_poissons_ratio``, to limit the substeps."""
     if body.poissons_ratio is None:
         return {}

@@ -16,15 +16,14 @@ from masiv.twin import Twin
 def simulate_release(twin: Twin, *, frames: int, fps: float) -> Rollout:
     """``frames`` frames at k / fps [s] after the release of the only body of ``twin``. Raises InputError,
     NonFiniteError."""
-    body = released_body(twin)
+    body, release = released_body(twin), twin.initial_conditions[0].release
+    assert release is not None  # released_body raises otherwise
     if frames < 2:
         raise InputError(f"--frames {frames}: give at least 2")
     times = np.arange(frames) / fps
     effects = body.effects(effect_members(twin, twin.body), body.context(float(times[-1]), 1 / fps))
     _, positions = body.run(twin.law, times, effects)
     world = body.axes.points_to_world(positions.double().numpy())
-    release = twin.initial_conditions[0].release
-    assert release is not None  # a clamped body is let go
     return Rollout(world.astype(np.float32), times, body.markers_to_world(positions), tuple(release.markers))
 
 

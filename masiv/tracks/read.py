@@ -19,7 +19,7 @@ from masiv.tracks.geometry import Geometry, make_geometry
 from masiv.tracks.placement import Placement, best_rigid
 from masiv.tracks.release import estimate_release
 from masiv.tracks.table import Table, read_table
-from masiv.tracks.tracks import Body, Clamp, Run, Tracks, rest_positions
+from masiv.tracks.tracks import Clamp, Run, TrackedBody, Tracks, rest_positions
 
 
 def can_read(folder: Path) -> bool:
@@ -62,7 +62,7 @@ def read_tracks(folder: Path) -> Tracks:
     )
 
 
-def _body(name: str, declared: BodyDeclaration, folder: Path) -> Body:
+def _body(name: str, declared: BodyDeclaration, folder: Path) -> TrackedBody:
     geometry, clamp = None, None
     density, mass = declared.density, declared.mass
     if declared.geometry is not None:
@@ -71,7 +71,7 @@ def _body(name: str, declared: BodyDeclaration, folder: Path) -> Body:
         mass = density * geometry.volume if density is not None else None
         clamp = _clamp(name, declared, geometry)
     group = name if declared.group is None else declared.group
-    return Body(name, group, geometry, density, mass, declared.poissons_ratio, clamp)
+    return TrackedBody(name, group, geometry, density, mass, declared.poissons_ratio, clamp)
 
 
 def _clamp(name: str, body: BodyDeclaration, geometry: Geometry) -> Clamp | None:
@@ -108,7 +108,7 @@ def _extent(geometry: Geometry) -> str:
 
 
 def _run(
-    run: RunDeclaration, declared: TracksDeclaration, bodies: dict[str, Body], folder: Path, problems: list[str]
+    run: RunDeclaration, declared: TracksDeclaration, bodies: dict[str, TrackedBody], folder: Path, problems: list[str]
 ) -> Run:
     values = [str(value) for value in run.select.values()]
     name = run.name or " ".join(values) or run.file.stem

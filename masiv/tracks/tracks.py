@@ -32,7 +32,7 @@ class Clamp:
 
 
 @dataclass(frozen=True)
-class Body:
+class TrackedBody:
     """One object; what is None is not known. density [kg/m³]; mass [kg]; bodies of one ``group`` share the laws of
     their surroundings. Where ``geometry`` and one of density and mass are known, so is the other."""
 
@@ -146,7 +146,7 @@ class Tracks:
     up: np.ndarray
     gravity: np.ndarray
     ground: Ground | None
-    bodies: dict[str, Body]
+    bodies: dict[str, TrackedBody]
     runs: tuple[Run, ...]
     problems: tuple[str, ...] = ()
     medium_density: float = 1.2
@@ -162,7 +162,7 @@ class Tracks:
             if run.purpose == purpose and body in (None, run.body) and condition in (None, run.condition)
         )
 
-    def groups(self) -> dict[str, tuple[Body, ...]]:
+    def groups(self) -> dict[str, tuple[TrackedBody, ...]]:
         """Bodies by the group in which they share the laws of their surroundings."""
         names = dict.fromkeys(body.group for body in self.bodies.values())
         return {name: tuple(b for b in self.bodies.values() if b.group == name) for name in names}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from masiv.errors import InputError
 from masiv.scene.scene import Ground
 from masiv.tracks.placement import Placement
 from masiv.tracks.tracks import Clamp
@@ -37,6 +38,10 @@ class Body:
     clamp: Clamp | None = None
     geometry: str | None = None
     drag: DragBody | None = None
+
+    def __post_init__(self) -> None:
+        if self.particles is not None:
+            check_shape(f"particles of body {self.name}", self.particles, (None, 3))
 
     @property
     def rigid(self) -> bool:
@@ -95,6 +100,10 @@ class InitialCondition:
     placement: Placement | None = None
     release: Release | None = None
 
+    def __post_init__(self) -> None:
+        check_shape(f"velocity in {self.observation}", self.velocity, (3,))
+        check_shape(f"omega in {self.observation}", self.omega, (3,))
+
 
 @dataclass(frozen=True)
 class TwinEffect:
@@ -141,6 +150,15 @@ class TwinEffect:
         bodies = not self.bodies or not other.bodies or bool(set(self.bodies) & set(other.bodies))
         return self.name == other.name and bodies and (None in (self.condition, other.condition)
                                                        or self.condition == other.condition)  # fmt: skip
+
+
+def check_shape(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
+    """Raises InputError if ``array`` does not have this shape (None: any length)."""
+    if len(np.shape(array)) != len(shape) or any(
+        n not in (None, m) for n, m in zip(shape, np.shape(array), strict=True)
+    ):
+        expected = ", ".join("Q" if n is None else str(n) for n in shape)
+        raise InputError(f"{name} has shape {np.shape(array)}, it must be ({expected}{',' * (len(shape) == 1)})")
 
 
 def with_start_values(start: InitialCondition, values: Mapping[str, float]) -> InitialCondition:

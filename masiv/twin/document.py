@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -20,8 +21,13 @@ from masiv.tracks.placement import Placement
 from masiv.tracks.tracks import Clamp
 from masiv.twin.body import OFFSET_UNITS, Body, Boundary, InitialCondition, Release, TwinEffect
 
+if TYPE_CHECKING:
+    from masiv.materials.law import Law
+
 SCHEMA = 2
 TWIN_FILE = "twin.yaml"
+SAME_LAW = 1e-4
+"""Relative difference [1] within which parameters of a law are the same; those of a neural law are computed anew."""
 
 Unit = TypeVar("Unit")
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -64,12 +70,13 @@ class EffectPart(Part):
 
 
 class LawPart(BaseModel):
-    """kind and parameters are for the reader: the law itself is in ``file``."""
+    """The law itself is in ``file``; kind and parameters repeat it for people, and may not differ from it."""
 
     model_config = ConfigDict(extra="allow", strict=True)
 
     kind: str
     file: FileName
+    parameters: dict[str, Any]
 
 
 class ParticlesPart(Part):
@@ -318,8 +325,7 @@ def _body(part: BodyPart, where: str, folder: Path) -> Body:
     law = None
     if part.law is not None:
         law = load_law(folder / part.law.file)
-        if law.kind != part.law.kind:
-            raise InputError(f"{where}.law.kind' is {part.law.kind!r}, but {part.law.file} holds a {law.kind} law")
+        _check_law(part.law, law, f"{where}.law")
     particles, spacing = None, None
     if part.particles is not None:
         particles = read_particles(folder / part.particles.file, part.particles.tensor)
@@ -339,6 +345,18 @@ def _body(part: BodyPart, where: str, folder: Path) -> Body:
     return Body(
         part.name, part.volume.value, part.density.value, law, particles, spacing, clamp, part.geometry, drag
     )  # fmt: skip
+
+
+def _check_law(part: LawPart, law: Law, where: str) -> None:
+    """Raises InputError if the document says something else than the law's file, as after an edit of one of them."""
+    if law.kind != part.kind:
+        raise InputError(f"{where}.kind' is {part.kind!r}, but {part.file} holds a {law.kind} law")
+    for name, row in law.description()["parameters"].items():
+        told = part.parameters.get(name)
+        value = told.get("value") if isinstance(told, dict) else None
+        if not isinstance(value, (int, float)) or not math.isclose(value, row["value"], rel_tol=SAME_LAW):
+            held = f"{part.file} holds {row['value']:g}"
+            raise InputError(f"{where}.parameters.{name}.value' is {value}, but {held}: identify again")
 
 
 def read_particles(path: Path, tensor: str) -> np.ndarray:

@@ -10,13 +10,12 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.geometry import fill_geometry, mean_diameter
 from masiv.tracks.placement import Placement
-from masiv.tracks.tracks import Body as DeclaredBody
-from masiv.tracks.tracks import Run, Tracks
+from masiv.tracks.tracks import Run, TrackedBody, Tracks
 from masiv.twin.body import Body, Boundary, InitialCondition, Release
 from masiv.twin.twin import Twin
 
 
-def drag_body(tracks: Tracks, body: DeclaredBody) -> DragBody:
+def drag_body(tracks: Tracks, body: TrackedBody) -> DragBody:
     """What the medium sees of a body. Raises InputError if its geometry or mass is not known."""
     if body.geometry is None or body.mass is None:
         raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass")
@@ -46,7 +45,7 @@ def twin_of_tracks(tracks: Tracks, config: TracksConfig, simulator: SimulatorCon
     )
 
 
-def _body(tracks: Tracks, body: DeclaredBody, config: TracksConfig, rigid: bool) -> Body:
+def _body(tracks: Tracks, body: TrackedBody, config: TracksConfig, rigid: bool) -> Body:
     drag = drag_body(tracks, body)
     assert body.geometry is not None  # drag_body raises otherwise
     assert body.density is not None

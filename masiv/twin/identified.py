@@ -10,17 +10,17 @@ from masiv.twin.document import TWIN_FILE
 from masiv.twin.twin import Twin
 
 IDENTIFIED_FILE = "twin.before.yaml"
-Scene = Callable[[], Twin]
-"""See ``Twin.load``."""
+DescribedTwin = Callable[[], Twin]
+"""The twin that a scene of tracks describes, see ``Twin.load``."""
 
 
-def load_identified(folder: Path, scene: Scene | None = None) -> Twin:
+def load_identified(folder: Path, scene: DescribedTwin | None = None) -> Twin:
     """The twin without effects that refine added. Raises InputError."""
     name = IDENTIFIED_FILE if (folder / IDENTIFIED_FILE).is_file() else TWIN_FILE
     return Twin.load(folder, name, scene=scene)
 
 
-def load_to_refine(folder: Path, condition: str | None = None, scene: Scene | None = None) -> Twin:
+def load_to_refine(folder: Path, condition: str | None = None, scene: DescribedTwin | None = None) -> Twin:
     """The twin from which refine of ``condition`` (None: the first) starts: without what an earlier one added there.
 
     The first condition starts with what identify found; effects of other conditions stay. Raises InputError.
@@ -39,14 +39,14 @@ def load_to_refine(folder: Path, condition: str | None = None, scene: Scene | No
     return replace(identified, effects=others, initial_conditions=starts)
 
 
-def save_refined(folder: Path, twin: Twin, scene: Scene | None = None) -> None:
+def save_refined(folder: Path, twin: Twin, scene: DescribedTwin | None = None) -> None:
     """Save ``twin``, after the one that identify made is kept under another name."""
     if not (folder / IDENTIFIED_FILE).is_file():
         Twin.load(folder, scene=scene).save(folder, IDENTIFIED_FILE)
     twin.save(folder)
 
 
-def restore_identified(folder: Path, scene: Scene | None = None) -> None:
+def restore_identified(folder: Path, scene: DescribedTwin | None = None) -> None:
     """Undo ``save_refined``, if there was one. Raises InputError."""
     if (folder / IDENTIFIED_FILE).is_file():
         load_identified(folder, scene).save(folder)

@@ -12,7 +12,7 @@ import numpy as np
 from masiv.errors import InputError
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
-from masiv.twin.body import Body, Boundary, InitialCondition, TwinEffect
+from masiv.twin.body import Body, Boundary, InitialCondition, TwinEffect, check_shape
 from masiv.twin.document import TWIN_FILE, read_document, write_document
 
 if TYPE_CHECKING:
@@ -36,6 +36,10 @@ class Twin:
     simulator: SimulatorConfig
     effects: tuple[TwinEffect, ...] = ()
     fit: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_shape("gravity", self.gravity, (3,))
+        check_shape("up", self.up, (3,))
 
     @classmethod
     def of_body(
