@@ -20,7 +20,7 @@ from masiv.cli import main
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.identify.from_tracks import described_twin
-from masiv.identify.tracks import fit_law, simulation_of
+from masiv.identify.tracks import clamped_body_model, fit_law
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.base import Model
@@ -120,7 +120,7 @@ def bar(tmp_path_factory):
 def test_damping_is_found_and_the_law_with_it(bar):
     known = {"poissons_ratio": RATIO}
     simulation = only(
-        simulation_of(bar, "", TRACKS, SIMULATOR, known=known), ("viscosity", "gravity_scale", "linear_drag")
+        clamped_body_model(bar, "", TRACKS, SIMULATOR, known=known), ("viscosity", "gravity_scale", "linear_drag")
     )
     base = fit_law(simulation, family_of("neo_hookean", 1070, known), TRACKS, quiet)
     assert base.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.15)
@@ -138,7 +138,7 @@ def test_damping_is_found_and_the_law_with_it(bar):
 @pytest.mark.slow
 def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
-    simulation = only(simulation_of(bar, "load", TRACKS, SIMULATOR, known=known), ("point_mass", "gravity_scale"))
+    simulation = only(clamped_body_model(bar, "load", TRACKS, SIMULATOR, known=known), ("point_mass", "gravity_scale"))
     family = family_of("neo_hookean", 1070, known)
     base = gauss_newton_fit(simulation, Model(family, "none", ("viscosity",)), {}, budget=4)
     assert simulation.curriculum(base.fields)  # its phase is lost
@@ -157,7 +157,7 @@ def test_one_body_from_its_law_to_its_twin(bar, tmp_path):
     what was accepted, and another condition on top of that."""
     config = RefineConfig.model_validate({"effects": ["viscosity"], "shortlist": 1, "max_effects": 1})
     known = {"poissons_ratio": RATIO}
-    simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known=known)
+    simulation = clamped_body_model(bar, "", TRACKS, SIMULATOR, known=known)
     model = Model(family_of("neo_hookean", 1070, known), "none")
     base = gauss_newton_fit(simulation, model, {"youngs_modulus": YOUNGS}, budget=6)
     twin = fitted_twin(described_twin(bar, TRACKS, SIMULATOR), base, simulation, {})
@@ -201,7 +201,7 @@ def test_settings_that_say_nothing_of_tracks_are_refused(bar, settings, words):
 
 
 def test_a_place_is_told_in_the_body(bar):
-    simulation = simulation_of(bar, "load", TRACKS, SIMULATOR, known={"poissons_ratio": RATIO})
+    simulation = clamped_body_model(bar, "load", TRACKS, SIMULATOR, known={"poissons_ratio": RATIO})
     run = simulation.observations[0]
     tip = np.array([0.0, 0.0, 0.05])  # own axes
     placement = next(r for r in bar.runs if r.name == run.name).placement
@@ -239,7 +239,7 @@ def test_a_static_deflection_strains_as_it_moves(bar):
 def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
     skipped = replace(bar, runs=tuple(replace(run, ignore_after_release=0.05) for run in bar.runs))
-    simulation = simulation_of(skipped, "", TRACKS, SIMULATOR, known=known)
+    simulation = clamped_body_model(skipped, "", TRACKS, SIMULATOR, known=known)
     run = next(r for r in simulation.observations if not r.fitted)
     assert run.times[0] >= 0.05
     model = Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",))
@@ -268,7 +268,7 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
     """Out of phase, and with no first moments to count from: from none, its derivative would lead elsewhere."""
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
     fitted = tuple(replace(run, ignore_after_release=0.04) for run in bar.runs if run.purpose == "fit")
-    simulation = simulation_of(replace(bar, runs=fitted), "load", TRACKS, SIMULATOR, known=known)
+    simulation = clamped_body_model(replace(bar, runs=fitted), "load", TRACKS, SIMULATOR, known=known)
     term = simulation.term("point_mass")
     places = tuple(sorted(term.guesses, key=lambda place: place[2]))  # along the bar, from the clamp
     coarse = replace(term, guesses=(places[0], places[-1]))
@@ -287,7 +287,7 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
 
 
 def test_what_acts_on_the_matter_at_a_place_is_in_the_body(bar):
-    simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known={})
+    simulation = clamped_body_model(bar, "", TRACKS, SIMULATOR, known={})
     particles = simulation.body(simulation.observations[0]).particles.numpy()
     for name in ("point_mass", "point_force"):
         for p, low, high in zip(simulation.term(name).others, particles.min(0), particles.max(0), strict=True):
@@ -358,4 +358,4 @@ def test_what_tracks_refuse(tmp_path, masiv):
 
 def test_unknown_condition_is_named(bar):
     with pytest.raises(InputError, match="no run of condition 'wind' to fit: its conditions are '', 'load'"):
-        simulation_of(bar, "wind", TRACKS, SIMULATOR, known={})
+        clamped_body_model(bar, "wind", TRACKS, SIMULATOR, known={})
