@@ -22,7 +22,7 @@ from typing import Any
 from masiv import runtime
 from masiv.errors import InputError, MasivError
 
-ONE_THREAD = dict.fromkeys(
+ONE_THREAD: dict[str, str] = dict.fromkeys(
     ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
 )
 """Environment variables that limit a process to one thread, if they are set before torch and Taichi are imported."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from cube import Seen
 from ring_scene import ring, spheres_scene
 from small import SMALL
-from test_identify import Seen
 
 from masiv.continuum.fill import DensityField, even_points
 from masiv.identify.losses.images import ImageTerms

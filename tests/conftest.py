@@ -19,3 +19,33 @@ def taichi():
     from masiv import runtime
 
     return runtime.start("cpu")
+
+
+# ---- the cube of tests/cube.py, simulated once a process ------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def body():
+    """Particles (343, 3) [m] of the cube."""
+    from cube import particles
+
+    return particles()
+
+
+@pytest.fixture(scope="session")
+def seen(taichi):
+    """What a fit sees of the elastic cube, and its positions (T, N, 3) [m] over four more frames."""
+    from cube import FRAMES, VOLUME, Seen, motion_of
+
+    from masiv.materials.classical import ClassicalLaw
+
+    motion = motion_of(ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3), FRAMES + 4)
+    return Seen(motion.positions[:FRAMES], motion.times[:FRAMES], VOLUME), motion.positions
+
+
+@pytest.fixture(scope="session")
+def filmed(seen):
+    """A scene with silhouettes of the same motion."""
+    from cube import silhouettes_of
+
+    return silhouettes_of(seen[1])

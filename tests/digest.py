@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 
 import torch
+from random_gaussians import BACKGROUND, make_camera, make_gaussians, weighted
 from small import NODES, SUBSTEPS
-from test_rasterise import BACKGROUND, make_camera, make_gaussians, weighted
 
 from masiv import runtime
 from masiv.materials.classical import ClassicalLaw

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from cube import noisy, scene
+from law_examples import EXAMPLES, F64, gradients
 from scipy.spatial.transform import Rotation
 from small import NODES, SMALL, SUBSTEPS
-from test_identify import scene
-from test_identify_classical import body, filmed, settings  # noqa: F401
-from test_laws import EXAMPLES, F64, gradients
 
 from masiv.checkpoint import Checkpoint
+from masiv.identify.config import IdentifyConfig
 from masiv.identify.stage import identify
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.classical import PARAMETERS, ClassicalLaw
@@ -99,7 +99,7 @@ def test_an_adapter_survives_saving(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("taichi")
-def test_fit_of_an_adapter_improves_on_its_base_and_resumes(body, tmp_path):  # noqa: F811
+def test_fit_of_an_adapter_improves_on_its_base_and_resumes(tmp_path):
     class Stop(Exception):
         pass
 
@@ -108,8 +108,17 @@ def test_fit_of_an_adapter_improves_on_its_base_and_resumes(body, tmp_path):  # 
             raise Stop
 
     # A body that yields, which no elastic law does.
-    seen = filmed(body, ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=2e3))
-    config = settings("adapter", adapter_base="neo_hookean", family_rollouts=12, iterations=4, pictures=0)
+    seen = noisy(ClassicalLaw("von_mises", youngs_modulus=1e5, poissons_ratio=0.3, yield_stress=2e3))
+    config = IdentifyConfig(
+        law="adapter",
+        contact="sticky",
+        search_particles=200,
+        samples_per_frame=1,
+        adapter_base="neo_hookean",
+        family_rollouts=12,
+        iterations=4,
+        pictures=0,
+    )
     whole = identify(scene(), seen, config, SMALL)
     assert whole.law.kind == "adapter"
     assert whole.fit["trajectory_error_mm"] <= whole.fit["classical_error_mm"] + 0.1

@@ -6,39 +6,15 @@ import sys
 
 import pytest
 import torch
-from small import NODES, SUBSTEPS
+from effect_cases import DT, F64, LAW, STEPS, body, setting, simulator
 
 import masiv.effects
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects
-from masiv.effects.context import EffectContext
 from masiv.effects.effect import KINDS, ContactEffect, Effect, NodalEffect
 from masiv.errors import InputError
-from masiv.materials.classical import ClassicalLaw
 from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import rollout
-from masiv.mpm.simulator import Simulator
-
-F64 = torch.float64
-DT, STEPS = 1e-3, 40
-LAW = ClassicalLaw("neo_hookean", youngs_modulus=2e4, poissons_ratio=0.3)
-
-
-def body(count=200, height=0.02):
-    generator = torch.Generator().manual_seed(1)
-    x = 0.2 * torch.rand(count, 3, generator=generator, dtype=F64)
-    x[:, 1] += height
-    return x
-
-
-def setting(x):
-    return EffectContext(torch.tensor([0.0, -9.8, 0.0], dtype=x.dtype), x, 1e3 * 0.2**3 / len(x), 0.2, STEPS * DT)
-
-
-def simulator(count, contact="sticky", gravity=(0, -9.8, 0), friction=0.3, dtype=F64):
-    return Simulator(particle_count=count, spacing=0.05, substep=DT, volume=0.2**3, density=1e3, gravity=gravity,
-                     contact=contact, friction=friction, dtype=dtype, max_substeps=SUBSTEPS,
-                     grid_nodes=NODES)  # fmt: skip
 
 
 def thrown_body(x):
@@ -135,6 +111,7 @@ def test_declaration(name):
         assert p.unit
         assert p.lower < p.upper
         assert 0 < p.step <= p.upper
+    assert effect.strengths >= 1
     assert all(p.lower <= 0 <= p.upper for p in effect.parameters[: effect.strengths])
     guesses = effect.guesses(setting(body()))
     assert 1 <= len(guesses) <= 12

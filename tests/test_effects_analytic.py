@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_effects import DT, F64, LAW, body, setting, simulator
+from effect_cases import DT, F64, LAW, body, setting, simulator
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects

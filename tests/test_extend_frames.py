@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_reconstruct import FPS, SIDE, ball, camera_at
+from textured_ball import FPS, SIDE, ball, camera_at
 
 from masiv.checkpoint import Checkpoint
 from masiv.config import Config

@@ -2,30 +2,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from ring_scene import ring, spheres_scene
 from scipy.spatial import cKDTree
+from still import still
 
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.fill import DensityField, even_points, fill_volume, in_front_of_surface
 from masiv.errors import MasivError
-from masiv.splat.deformation import DeformationNetwork
-from masiv.splat.dynamic import DynamicGaussians
-from masiv.splat.gaussians import Gaussians
 
 CENTRE, RADIUS = np.array([0.05, 0.45, 0.0]), 0.25
 CONFIG = TrajectoryConfig(particle_count=1500, fill_resolution=40)
-
-
-def still(means: np.ndarray, scale: float) -> DynamicGaussians:
-    """Opaque Gaussians that do not move."""
-    means = torch.as_tensor(means, dtype=torch.float32)
-    network = DeformationNetwork(
-        centre=means.mean(0), half_extent=0.3, frame_count=4, fps=24.0, base_motion=torch.zeros(4, 3), width=8
-    )
-    count = len(means)
-    gaussians = Gaussians(means, torch.full((count,), scale), torch.full((count,), 0.95), torch.ones(count, 3))
-    return DynamicGaussians(gaussians, network.requires_grad_(False))
 
 
 def sphere_points(count: int, radius: float) -> np.ndarray:

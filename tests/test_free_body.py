@@ -8,8 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_refine import VELOCITY
-from test_workers import small_simulation
+from flight import VELOCITY, small_simulation
 
 from masiv.errors import MasivError
 from masiv.inference.least_squares import derivative

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from cube import scene, settings
 from small import SMALL
-from test_identify import body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.identify.losses.geometry import chamfer_error, surface_points, trajectory_error
 from masiv.identify.stage import identify
@@ -38,7 +38,7 @@ def test_the_surface_of_a_cube_is_its_outer_layer():
 
 
 @pytest.mark.parametrize("loss", ["continuum", "surface"])
-def test_a_fit_to_sets_of_points_ends_near_the_motion(seen, loss):  # noqa: F811
+def test_a_fit_to_sets_of_points_ends_near_the_motion(seen, loss):
     twin = identify(scene(), seen[0], settings(geometry_loss=loss, iterations=6), SMALL)
     assert twin.fit["geometry_loss"] == loss
     assert twin.fit["trajectory_error_mm"] < 30

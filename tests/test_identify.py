@@ -1,16 +1,14 @@
 """Initial motion, starting law and joint fit on trajectories simulated with a known law."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from cube import FPS, FRAMES, GRAVITY, OMEGA, UP, VELOCITY, scene, settings
 from scipy.spatial.transform import Rotation
 from small import SMALL
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
-from masiv.identify.config import IdentifyConfig
 from masiv.identify.losses.objective import Objective
 from masiv.identify.neural.starting_law import (
     DIVERGED,
@@ -20,63 +18,14 @@ from masiv.identify.neural.starting_law import (
     rank_starting_laws,
 )
 from masiv.identify.stage import identify
-from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, estimate_initial_motion
 from masiv.pretraining.pretrain import pretrained_path
-from masiv.scene.scene import Ground, Scene
+from masiv.scene.scene import Ground
 from masiv.simulation.simulate import simulate
 from masiv.simulation.subdivide import merge_subparticles
 from masiv.twin import Twin
-
-GRAVITY = np.array([0.0, -9.8, 0.0])
-UP = np.array([0.0, 1.0, 0.0])
-GROUND = Ground(UP, 0.0)
-FPS, FRAMES = 24.0, 9
-VELOCITY, OMEGA = np.array([0.5, -1.0, 0.2]), np.array([1.0, 2.0, -1.0])
-
-
-def no_picture(view, frame):
-    raise AssertionError("this fit has no business with pictures")
-
-
-def scene():
-    return Scene(
-        path=Path("simulated"), layout="none", fps=FPS, frame_count=FRAMES, cameras=(), gravity=GRAVITY, up=UP,
-        ground=GROUND, density=1000.0, load=no_picture, mask_source="none",
-    )  # fmt: skip
-
-
-class Seen:
-    """A trajectory known at the frames, linear between them."""
-
-    def __init__(self, positions, times, volume):
-        self.positions, self.times, self.volume = positions, times, volume
-
-    def evaluate(self, times):
-        exact = np.asarray(times) * FPS
-        low = np.clip(np.floor(exact).astype(int), 0, len(self.times) - 2)
-        share = (exact - low)[:, None, None]
-        return ((1 - share) * self.positions[low] + share * self.positions[low + 1]).astype(np.float32)
-
-
-@pytest.fixture(scope="module")
-def body():
-    axis = (np.arange(7) + 0.5) / 7 * 0.4
-    x = np.stack(np.meshgrid(axis, axis + 0.15, axis, indexing="ij"), -1).reshape(-1, 3)
-    return x.astype(np.float32)
-
-
-@pytest.fixture(scope="module")
-def seen(taichi, body):
-    law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
-    truth = Twin.of_body(
-        positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
-        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SMALL,
-    )  # fmt: skip
-    motion = simulate(truth, frames=FRAMES + 4)
-    return Seen(motion.positions[:FRAMES], motion.times[:FRAMES], 0.064), motion.positions
 
 
 def test_initial_motion_of_a_rigid_body(body):
@@ -107,11 +56,6 @@ def test_flight_ends_where_the_body_hits_what_nobody_declared(body):
         path[frame, :, 1] = path[frame].mean(0)[1] + (1 - 0.1 * (frame - 4)) * (path[frame] - path[frame].mean(0))[:, 1]
     initial_motion = estimate_initial_motion(path, times, GRAVITY, Ground(UP, -10.0), clearance=0.05)
     assert initial_motion.last_frame == 4
-
-
-def settings(**changes):
-    fast = dict(processes=1, start="jelly", contact="sticky", iterations=14, pictures=0, search_particles=200)
-    return IdentifyConfig(**(fast | changes))
 
 
 def test_an_inelastic_starting_law_must_be_nearer_by_a_margin():
@@ -185,5 +129,5 @@ def test_twin_survives_saving(seen, tmp_path):
     with pytest.raises(InputError, match="--velocity"):
         simulate(again, frames=2, velocity=np.array([np.nan, 0.0, 0.0]))
     (tmp_path / "twin.yaml").write_text("schema: 1\n")
-    with pytest.raises(InputError, match="no twin"):
+    with pytest.raises(InputError, match="is not a twin"):
         Twin.load(tmp_path)

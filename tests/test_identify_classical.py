@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
+from cube import VELOCITY, noisy, scene
 from small import SMALL
-from test_identify import FPS, FRAMES, GRAVITY, GROUND, OMEGA, UP, VELOCITY, Seen, scene
 
 from masiv.checkpoint import Checkpoint
 from masiv.identify.classical import shortlist
@@ -18,26 +18,6 @@ from masiv.inference.noise_model import effective_samples
 from masiv.materials.classical import ClassicalLaw
 from masiv.models import families
 from masiv.models.families import FAMILIES, law_of
-from masiv.simulation.simulate import simulate
-from masiv.twin import Twin
-
-
-@pytest.fixture(scope="module")
-def body():
-    axis = (np.arange(7) + 0.5) / 7 * 0.4
-    x = np.stack(np.meshgrid(axis, axis + 0.15, axis, indexing="ij"), -1).reshape(-1, 3)
-    return x.astype(np.float32)
-
-
-def filmed(body, law):
-    truth = Twin.of_body(
-        positions=body, velocity=VELOCITY, omega=OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
-        volume=0.064, density=1000.0, up=UP, fps=FPS, law=law, simulator=SMALL,
-    )  # fmt: skip
-    motion = simulate(truth, frames=FRAMES)
-    noise = np.random.default_rng(0).normal(0, 1e-3, motion.positions.shape).astype(np.float32)
-    noise[0] = 0
-    return Seen(motion.positions + noise, motion.times, 0.064)
 
 
 def settings(law, **changes):
@@ -57,9 +37,9 @@ TRUTHS = {
 
 @pytest.mark.usefixtures("taichi")
 @pytest.mark.parametrize("kind", list(TRUTHS))
-def test_parameters_are_recovered_with_errors_that_cover_them(body, kind):
+def test_parameters_are_recovered_with_errors_that_cover_them(kind):
     truth, tolerance = TRUTHS[kind]
-    twin = identify(scene(), filmed(body, ClassicalLaw(kind, **truth)), settings(kind), SMALL)
+    twin = identify(scene(), noisy(ClassicalLaw(kind, **truth)), settings(kind), SMALL)
     described = twin.law.description()
     assert described["kind"] == kind
     assert twin.fit["trajectory_error_mm"] < 4
@@ -71,7 +51,7 @@ def test_parameters_are_recovered_with_errors_that_cover_them(body, kind):
 
 
 @pytest.mark.usefixtures("taichi")
-def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(body, tmp_path):
+def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(tmp_path):
     class Stop(Exception):
         pass
 
@@ -82,7 +62,7 @@ def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(body, tmp_path):
         if "fit, 8 frames" in stage and done == 5:
             raise Stop
 
-    seen = filmed(body, ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3))
+    seen = noisy(ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3))
     config = settings("neo_hookean", family_rollouts=14)
     whole = identify(scene(), seen, config, SMALL)
     path = tmp_path / "identify.pt"
@@ -94,6 +74,7 @@ def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(body, tmp_path):
         scene(), seen, config, SMALL, checkpoint=Checkpoint(path),
         progress=lambda stage, *_: stages.append(stage),
     )  # fmt: skip
+    assert stages
     assert not any("search" in stage for stage in stages)
     assert whole.law.description() == resumed.law.description()
     assert whole.fit == resumed.fit
@@ -101,10 +82,10 @@ def test_interrupted_fit_of_a_family_ends_with_the_same_numbers(body, tmp_path):
 
 
 @pytest.mark.usefixtures("taichi")
-def test_auto_names_the_family_that_moved_so(body, monkeypatch):
+def test_auto_names_the_family_that_moved_so(monkeypatch):
     coarse = {kind: dataclasses.replace(FAMILIES[kind], search={}) for kind in ("newtonian", "neo_hookean")}
     monkeypatch.setattr(shortlist, "FAMILIES", coarse)
-    seen = filmed(body, ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3))
+    seen = noisy(ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3))
     twin = identify(scene(), seen, settings("auto", family_rollouts=24), SMALL)
     assert twin.fit["law"] == twin.law.kind == "neo_hookean"
     rows = twin.fit["families"]

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_identify import OMEGA, VELOCITY, Seen, body, scene, seen  # noqa: F401  (fixtures)
-from test_surface_finetune import filmed, objective_of  # noqa: F401
+from cube import OMEGA, VELOCITY, Seen, objective_of
 
 from masiv.checkpoint import Checkpoint
 from masiv.identify.classical.fit import fit_all_particles, fit_family, fit_further
@@ -27,7 +26,7 @@ def values_of(objective, **changes):
     return {**TRUE, **{p.name: p.start for p in start}, **changes}
 
 
-def test_paths_come_first_and_are_metres_again(filmed, seen):  # noqa: F811
+def test_paths_come_first_and_are_metres_again(filmed, seen):
     objective = objective_of(filmed, seen, samples_per_frame=2)
     problem = objective.problem
     plain, both = (JointResidual(objective, FAMILIES["neo_hookean"], "sticky", 3, with_images=w) for w in (False, True))
@@ -43,7 +42,7 @@ def test_paths_come_first_and_are_metres_again(filmed, seen):  # noqa: F811
     assert (squared[: paths.size] ** 2).sum() == pytest.approx(mean_square, rel=1e-4)
 
 
-def test_pictures_are_nearest_at_the_truth(filmed, seen):  # noqa: F811
+def test_pictures_are_nearest_at_the_truth(filmed, seen):
     objective = objective_of(filmed, seen)
     problem = objective.problem
     joint = JointResidual(objective, FAMILIES["neo_hookean"], "sticky", problem.frames, with_images=True)
@@ -57,7 +56,7 @@ def test_pictures_are_nearest_at_the_truth(filmed, seen):  # noqa: F811
         assert of_pictures(**changes) > 1.02 * here
 
 
-def test_paths_that_drift_are_overruled(filmed, seen):  # noqa: F811
+def test_paths_that_drift_are_overruled(filmed, seen):
     true = seen[0]
     drift = (DRIFT * true.times[:, None, None]).astype(np.float32)
     drifted = Seen(true.positions + drift, true.times, true.volume), seen[1]
@@ -76,7 +75,7 @@ def test_paths_that_drift_are_overruled(filmed, seen):  # noqa: F811
     assert off[1] < 0.3 * DRIFT[0]
 
 
-def test_the_coarse_search_compares_pictures_too(filmed, seen, monkeypatch):  # noqa: F811
+def test_the_coarse_search_compares_pictures_too(filmed, seen, monkeypatch):
     """Paths as a body twenty times as stiff would have them."""
     law = ClassicalLaw("neo_hookean", youngs_modulus=6e5, poissons_ratio=0.3)
     objective = objective_of(filmed, seen, silhouette_weight=5.0, color_weight=0.0)

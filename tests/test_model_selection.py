@@ -3,8 +3,7 @@
 import dataclasses
 
 import pytest
-from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen  # noqa: F401  (fixtures)
-from test_surface_finetune import filmed, objective_of  # noqa: F401
+from cube import OMEGA, VELOCITY, objective_of, scene
 
 from masiv.checkpoint import Checkpoint
 from masiv.identify.classical import shortlist
@@ -24,7 +23,7 @@ def fitted(objective, kind, values, mean_square):
     return FamilyFit(kind, "sticky", every, mean_square=mean_square, samples=100)
 
 
-def test_pictures_decide_against_paths(filmed, seen):  # noqa: F811
+def test_pictures_decide_against_paths(filmed, seen):
     objective = objective_of(filmed, seen)
     fits = [fitted(objective, "newtonian", WRONG, 1e-6), fitted(objective, "neo_hookean", TRUE, 1e-2)]
     errors = image_losses(objective, fits)
@@ -32,14 +31,14 @@ def test_pictures_decide_against_paths(filmed, seen):  # noqa: F811
     assert [f.kind for f in rank_by_image_loss(fits, errors)] == ["neo_hookean", "newtonian"]
 
 
-def test_without_pictures_paths_decide(filmed, seen):  # noqa: F811
+def test_without_pictures_paths_decide(filmed, seen):
     objective = objective_of(filmed, seen, pictures=0)
     fits = [fitted(objective, "newtonian", WRONG, 1e-6), fitted(objective, "neo_hookean", TRUE, 1e-2)]
     assert image_losses(objective, fits) == {}
     assert [f.kind for f in rank_by_image_loss(fits, {})] == ["newtonian", "neo_hookean"]
 
 
-def test_what_diverges_comes_last(filmed, seen):  # noqa: F811
+def test_what_diverges_comes_last(filmed, seen):
     objective = objective_of(filmed, seen)
     good = fitted(objective, "neo_hookean", TRUE, 1.0)
     wild = dataclasses.replace(good, kind="newtonian", values={**good.values, **WRONG, "velocity_x": float("nan")})
@@ -53,7 +52,7 @@ def test_a_law_with_more_parameters_must_be_nearer_by_a_tenth(rich, first):
     assert rank_by_image_loss(fits, {"rich": rich, "simple": 0.1})[0].kind == first
 
 
-def test_a_search_that_was_killed_goes_on_with_its_finalists(filmed, seen, tmp_path, monkeypatch):  # noqa: F811
+def test_a_search_that_was_killed_goes_on_with_its_finalists(filmed, seen, tmp_path, monkeypatch):
     """A family that was fitted further may be farther from the pictures than before; no other takes its place."""
     checkpoint, gone_on, shift = Checkpoint(tmp_path / "identify.pt"), [], 0
 

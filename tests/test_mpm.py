@@ -9,7 +9,8 @@ import torch
 from small import NODES, SUBSTEPS
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.bound import BoundEffects
+from masiv.effects.catalogue import effect_named
+from masiv.effects.context import EffectContext
 from masiv.errors import InputError, NonFiniteError
 from masiv.identify.neural.starting_law import with_scales
 from masiv.materials.classical import ClassicalLaw
@@ -117,8 +118,8 @@ def test_substeps_and_gradients_equal_the_twin(law, contact):
         c = sim.constants
         for _ in range(steps):
             state = _substep(
-                state, law, mass=float(sim.mass[0]), volume=c["volume"], spacing=sim.spacing, substep=sim.substep,
-                gravity=c["gravity"], contact=contact,
+                state, law, mass=float(sim.mass[0]), volume=c.volume, spacing=sim.spacing, substep=sim.substep,
+                gravity=c.gravity, contact=contact,
             )  # fmt: skip
         return state.position
 
@@ -199,8 +200,9 @@ def test_substeps_launched_at_once_and_one_by_one_and_in_parts_are_the_same(monk
     for serial in (10**6, 0):
         monkeypatch.setattr("masiv.mpm.taped_rollout.SERIAL_PARTICLES", serial)
         ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
-    monkeypatch.setattr(BoundEffects, "empty", False)  # launch by launch, as with effects
-    ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
+    context = EffectContext(torch.tensor([0.0, -9.8, 0.0]), start.position, 0.135, 0.3, 0.08)
+    no_drag = ActiveEffects(((effect_named("linear_drag"), torch.zeros(1)),), context)  # launch by launch
+    ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], no_drag).positions)
     for end in ends[1:]:
         np.testing.assert_allclose(end.numpy(), ends[0].numpy(), atol=1e-6)
 

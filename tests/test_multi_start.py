@@ -1,8 +1,8 @@
 """Two starts that few particles cannot distinguish: both are fitted, the better fit is kept."""
 
 import pytest
+from cube import scene, settings
 from small import SMALL
-from test_identify import body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
@@ -17,7 +17,7 @@ from masiv.models.initial_state import InitialState
 from masiv.progress import silent
 
 
-def fit(seen, monkeypatch, errors, objectives, image_losses=None):  # noqa: F811
+def fit(seen, monkeypatch, errors, objectives, image_losses=None):
     """The material that is kept, and those that were fitted. errors: of starting laws; objectives: of fits, None
     diverges; image_losses: after the surface finetune of each, None without such a finetune."""
     fitted, laws = [], {name: NeuralLaw(seed=k) for k, name in enumerate(errors)}
@@ -62,19 +62,19 @@ def fit(seen, monkeypatch, errors, objectives, image_losses=None):  # noqa: F811
         ({"jelly": 0.1, "plasticine": 0.1}, {"jelly": 0.2, "plasticine": 0.19}, "jelly", True),
     ],
 )
-def test_the_better_of_two_fits_is_kept(seen, monkeypatch, errors, objectives, kept, both):  # noqa: F811
+def test_the_better_of_two_fits_is_kept(seen, monkeypatch, errors, objectives, kept, both):
     result, fitted = fit(seen, monkeypatch, errors, objectives)
     assert result == kept
     assert fitted == list(errors)[: 2 if both else 1]
 
 
-def test_fits_are_compared_after_the_surface_finetune(seen, monkeypatch):  # noqa: F811
+def test_fits_are_compared_after_the_surface_finetune(seen, monkeypatch):
     starts, fits = {"maxwell_fluid": 0.1, "plasticine": 0.12}, {"maxwell_fluid": 0.3, "plasticine": 0.2}
     kept, fitted = fit(seen, monkeypatch, starts, fits, {"maxwell_fluid": 0.18, "plasticine": 0.19})
     assert kept == "maxwell_fluid"
     assert fitted == ["maxwell_fluid", "plasticine"]
 
 
-def test_if_every_fit_diverges_the_stage_says_so(seen, monkeypatch):  # noqa: F811
+def test_if_every_fit_diverges_the_stage_says_so(seen, monkeypatch):
     with pytest.raises(MasivError, match="keeps diverging"):
         fit(seen, monkeypatch, {"maxwell_fluid": 0.1, "plasticine": 0.12}, {"maxwell_fluid": None, "plasticine": None})

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from textured_ball import FPS, FRAMES, SIDE, ball, camera_at
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.progress import silent
-from masiv.scene.camera import Camera
 from masiv.scene.scene import Frame, Scene
 from masiv.splat._reference import _render
 from masiv.splat.config import ReconstructConfig
@@ -26,7 +26,6 @@ from masiv.splat.reconstruct import reconstruct
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
-SIDE, FRAMES, FPS = 40, 4, 24.0
 SPIN = np.array([0.03, 0.08, 0.05])  # rad a frame
 CONFIG = ReconstructConfig(
     gaussians=250,
@@ -43,30 +42,10 @@ CONFIG = ReconstructConfig(
 )
 
 
-def ball(count=400):
-    """Points on a sphere of radius 0.2 m around (0, 0.5, 0), with colours in large patches."""
-    k = np.arange(count) + 0.5
-    polar, turn = np.arccos(1 - 2 * k / count), np.pi * (1 + 5**0.5) * k
-    unit = np.stack([np.cos(turn) * np.sin(polar), np.cos(polar), np.sin(turn) * np.sin(polar)], axis=1)
-    return unit, 0.5 + 0.4 * np.sin(4 * unit + np.array([0.0, 1.0, 2.0]))
-
-
 def truth(unit, frame):
     """It moves along x and down, faster and faster, and flattens."""
     squash = np.array([1 + 0.04 * frame, 1 - 0.07 * frame, 1 + 0.04 * frame])
     return 0.2 * unit * squash + np.array([0.03 * frame, 0.5 - 0.015 * frame**2, 0.0])
-
-
-def camera_at(angle, height):
-    eye = np.array([1.2 * np.sin(angle), height, 1.2 * np.cos(angle)])
-    forward = np.array([0, 0.45, 0]) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 1, 0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eye
-    return Camera(f"{angle:.1f}", SIDE, SIDE, np.array([[55.0, 0, SIDE / 2], [0, 55.0, SIDE / 2], [0, 0, 1]]), pose)
 
 
 def spun(unit, frame):

@@ -6,21 +6,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from cube import FRAMES, OMEGA, VELOCITY, VOLUME, Seen, motion_of, scene, settings
 from small import SMALL
-from test_identify import (  # noqa: F401  (fixtures)
-    FPS,
-    FRAMES,
-    GRAVITY,
-    GROUND,
-    OMEGA,
-    UP,
-    VELOCITY,
-    Seen,
-    body,
-    scene,
-    seen,
-    settings,
-)
 
 from masiv.checkpoint import Checkpoint
 from masiv.cli.main import run
@@ -32,26 +19,20 @@ from masiv.identify.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.pretraining.pretrain import pretrained_path
-from masiv.simulation.simulate import simulate
-from masiv.twin import Twin
 
 DROP = np.array([-0.3, -2.5, 0.1])
 """A faster release [m/s], which deforms the body more."""
 
 
 @pytest.fixture(scope="module")
-def dropped(taichi, body):  # noqa: F811
+def dropped(taichi):
     """Another recording of the body of ``seen``."""
-    truth = Twin.of_body(
-        positions=body, velocity=DROP, omega=-OMEGA, gravity=GRAVITY, ground=GROUND, contact="sticky", friction=0.0,
-        volume=0.064, density=1000.0, up=UP, fps=FPS,
-        law=ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3), simulator=SMALL,
-    )  # fmt: skip
-    motion = simulate(truth, frames=FRAMES - 1)  # one frame fewer: films differ in length
-    return Seen(motion.positions, motion.times, 0.064)
+    law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
+    motion = motion_of(law, FRAMES - 1, DROP, -OMEGA)  # one frame fewer: films differ in length
+    return Seen(motion.positions, motion.times, VOLUME)
 
 
-def recordings_of(seen, dropped, config):  # noqa: F811
+def recordings_of(seen, dropped, config):
     shorter = dataclasses.replace(scene(), frame_count=FRAMES - 1)
     films = (scene(), seen[0]), (shorter, dropped)
     return [prepare_recording(*film, config, SMALL)[0] for film in films]
@@ -69,7 +50,7 @@ def fitted(recordings, law=None):
     return train(recordings, start, "sticky", seed=0, checkpoint=Checkpoint(None), progress=lambda *_: None)
 
 
-def test_a_law_of_two_recordings_explains_both(seen, dropped):  # noqa: F811
+def test_a_law_of_two_recordings_explains_both(seen, dropped):
     both = recordings_of(seen, dropped, settings(iterations=14))
     start = fitted(recordings_of(seen, dropped, settings(iterations=0)))
     end = fitted(both)
@@ -85,7 +66,7 @@ def test_a_law_of_two_recordings_explains_both(seen, dropped):  # noqa: F811
         np.testing.assert_allclose(state.velocity.numpy(), velocity, atol=0.1)
 
 
-def test_each_recording_has_the_same_weight(seen, dropped, monkeypatch):  # noqa: F811
+def test_each_recording_has_the_same_weight(seen, dropped, monkeypatch):
     """A step from the same recording twice equals that from it once (later ones differ: gradients of initial states
     are clipped)."""
     gradients = []
@@ -107,7 +88,7 @@ def test_each_recording_has_the_same_weight(seen, dropped, monkeypatch):  # noqa
     assert once.law.wave_modulus() != pytest.approx(stiffer(2.0).wave_modulus(), rel=1e-2)
 
 
-def test_a_stage_that_is_killed_goes_on_with_all_recordings(seen, dropped, tmp_path):  # noqa: F811
+def test_a_stage_that_is_killed_goes_on_with_all_recordings(seen, dropped, tmp_path):
     class Stop(Exception):
         pass
 

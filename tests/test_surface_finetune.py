@@ -1,57 +1,21 @@
 """Surfaces after paths: the pictures decide, and a killed run goes on where it was."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
-from ring_scene import look_at
+from cube import OMEGA, VELOCITY, objective_of, scene, settings
 from small import SMALL
-from test_identify import GRAVITY, OMEGA, VELOCITY, body, scene, seen, settings  # noqa: F401  (fixtures)
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.identify.losses.images import pictures_of_each_frame
-from masiv.identify.losses.objective import Objective
 from masiv.identify.neural import surface_finetune
 from masiv.identify.neural.training import TrainingResult
 from masiv.identify.recording import FitRecording
 from masiv.identify.stage import identify
 from masiv.materials.load import load_law
-from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
 from masiv.pretraining.pretrain import pretrained_path
-from masiv.scene.scene import Frame
-from masiv.splat.rasteriser import render
-
-SIDE = 48
-
-
-@pytest.fixture(scope="module")
-def filmed(seen):  # noqa: F811
-    """The scene of test_identify, seen by four cameras as silhouettes of the true motion."""
-    positions = seen[1]
-    target = positions[4].mean(0).astype(float)
-    angles = np.deg2rad([10, 100, 190, 280])
-    cameras = tuple(
-        look_at(f"{k}", target + 2.0 * np.array([np.cos(a), 0.4, np.sin(a)]), target, SIDE, 55.0)
-        for k, a in enumerate(angles)
-    )
-
-    def load(view, frame):
-        count = positions.shape[1]
-        picture = render(cameras[view], torch.as_tensor(positions[frame]), torch.full((count,), 0.03),
-                         torch.full((count,), 0.9), torch.zeros(count, 3), torch.zeros(3))  # fmt: skip
-        mask = (picture.alpha.detach() > 0.5).float().numpy()
-        return Frame(np.zeros((SIDE, SIDE, 3), np.uint8), mask, np.ones((SIDE, SIDE), bool))
-
-    return dataclasses.replace(scene(), cameras=cameras, load=load, mask_source="alpha")
-
-
-def objective_of(filmed, seen, **changes):  # noqa: F811
-    config = settings(**{"pictures": 4, "iterations": 16, **changes})
-    problem = FilmedBody(filmed, seen[0], SMALL, samples=config.samples_per_frame)
-    return Objective(problem, config)
 
 
 def trained(objective, error):
@@ -75,7 +39,7 @@ def image_loss(objective, report, name):
     return config.finetune_silhouette_weight * report[f"silhouette_error_of_{name}"] + color
 
 
-def test_surfaces_correct_what_paths_had_wrong(filmed, seen):  # noqa: F811
+def test_surfaces_correct_what_paths_had_wrong(filmed, seen):
     objective = objective_of(filmed, seen, velocity_learning_rate=0.06)
     better, loss, report = finetune(objective, trained(objective, 0.4))
     assert report["silhouette_error_of_surfaces"] < 0.8 * report["silhouette_error_of_paths"]
@@ -84,7 +48,7 @@ def test_surfaces_correct_what_paths_had_wrong(filmed, seen):  # noqa: F811
     assert objective.config.geometry_loss == "trajectory"  # the objective of the paths is not changed
 
 
-def test_a_finetune_that_is_farther_from_the_pictures_is_not_kept(filmed, seen):  # noqa: F811
+def test_a_finetune_that_is_farther_from_the_pictures_is_not_kept(filmed, seen):
     """Observed surfaces that drift backwards by 5 cm a frame draw the velocity away from the truth."""
     weights = {"finetune_silhouette_weight": 1e-3, "finetune_color_weight": 0.0}
     steps = {"velocity_learning_rate": 0.06, "law_learning_rate": 1e-9, "scale_learning_rate": 1e-9}
@@ -98,7 +62,7 @@ def test_a_finetune_that_is_farther_from_the_pictures_is_not_kept(filmed, seen):
     assert report["silhouette_error_of_surfaces"] > report["silhouette_error_of_paths"]
 
 
-def test_the_weight_of_silhouettes_decides_between_paths_and_pictures(filmed, seen):  # noqa: F811
+def test_the_weight_of_silhouettes_decides_between_paths_and_pictures(filmed, seen):
     """Paths that have drifted by 3 cm, and silhouettes that have not."""
     true, drift = torch.as_tensor(seen[1]), torch.tensor([0.03, 0.0, 0.0])
     for weight, prefers_true in ((0.01, False), (10.0, True)):
@@ -110,14 +74,14 @@ def test_the_weight_of_silhouettes_decides_between_paths_and_pictures(filmed, se
         assert (objective.evaluate(here) < objective.evaluate(here + drift)) == prefers_true
 
 
-def test_a_checkpoint_of_an_older_version_is_refused_in_a_sentence(filmed, seen):  # noqa: F811
+def test_a_checkpoint_of_an_older_version_is_refused_in_a_sentence(filmed, seen):
     state = trained(objective_of(filmed, seen), 0.0).state()
     del state["objective"]
     with pytest.raises(MasivError, match="delete checkpoints/"):
         TrainingResult.from_state(state, load_law(pretrained_path("jelly")))
 
 
-def test_there_is_a_surface_finetune_only_with_pictures_to_compare(filmed, seen):  # noqa: F811
+def test_there_is_a_surface_finetune_only_with_pictures_to_compare(filmed, seen):
     assert objective_of(filmed, seen).has_surface_finetune
     for changes in ({"surface_finetune": False}, {"geometry_loss": "surface"}, {"pictures": 0}):
         assert not objective_of(filmed, seen, **changes).has_surface_finetune
@@ -128,7 +92,7 @@ def test_there_is_a_surface_finetune_only_with_pictures_to_compare(filmed, seen)
 
 
 @pytest.mark.parametrize("stop", [("identify: fit", 3), ("identify: fit surfaces", 1)])
-def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers(filmed, seen, tmp_path, stop):  # noqa: F811
+def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers(filmed, seen, tmp_path, stop):
     class Stop(Exception):
         pass
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from dropped_balls import Ball, write_scene
 
 from masiv.errors import InputError
 from masiv.models.base import Model
@@ -19,52 +18,8 @@ from masiv.refine.config import RefineConfig
 from masiv.refine.from_tracks import refine_group
 from masiv.refine.search_state import SearchSettings
 from masiv.tracks.geometry import mean_diameter
-from masiv.tracks.read import read_tracks
 
 pytestmark = pytest.mark.usefixtures("taichi")
-G, AIR = 9.8, 1.2
-
-
-@dataclass(frozen=True)
-class Ball:
-    mass: float
-    diameter: float
-    drag: float
-
-    @property
-    def rate(self) -> float:
-        """k of a = -k v^2 [1/m]."""
-        return AIR * self.drag * np.pi * self.diameter**2 / (8 * self.mass)
-
-    def fallen(self, t: np.ndarray, speed: float) -> np.ndarray:
-        """Way down [m], begun at ``speed`` [m/s] downwards, below the terminal velocity."""
-        if self.rate == 0:
-            return speed * t + 0.5 * G * t**2
-        end = np.sqrt(G / self.rate)
-        phase = np.arctanh(speed / end)
-        return end**2 / G * (np.log(np.cosh(G * t / end + phase)) - np.log(np.cosh(phase)))
-
-
-def write_scene(folder, balls, noise=0.01, runs=(1, 2)):
-    random = np.random.default_rng(3)
-    rows, declared, files = ["ball,drop,t,height"], {}, []
-    for name, ball in balls.items():
-        declared[name] = {
-            "mass": ball.mass, "group": "balls",
-            "geometry": {"sphere": ball.diameter, "units": "m", "markers_at": {"centre": [0, 0, 0]}},
-        }  # fmt: skip
-        for drop in runs:
-            t = np.arange(0, 2.6, 1 / 15)
-            heights = 40 + drop - ball.fallen(t, 0.3 * drop) + random.normal(0, noise, len(t))
-            rows += [f"{name},{drop},{a:.9f},{b:.12f}" for a, b in zip(t, heights, strict=True)]
-            files.append({"file": "drops.csv", "body": name, "select": {"ball": name, "drop": drop},
-                          "use": "fit" if drop == 1 else "hold_out"})  # fmt: skip
-    (folder / "drops.csv").write_text("\n".join(rows))
-    (folder / "scene.yaml").write_text(yaml.safe_dump({
-        "layout": "tracks", "units": "m", "up_axis": "y", "bodies": declared, "runs": files,
-        "columns": {"time": "t", "markers": {"centre": {"y": "height"}}},
-    }))  # fmt: skip
-    return read_tracks(folder)
 
 
 def found(tracks):
@@ -75,6 +30,7 @@ def test_flight_is_that_of_the_closed_form(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.5)}
     tracks = write_scene(tmp_path, balls, noise=0.0)
     simulation = PointMassModel(tracks, flight_observations(tracks, "balls"))
+    assert len(simulation.observations) == 4
     for run in simulation.observations:
         ball = balls[run.body]
         model = Model(RIGID, "none", ("quadratic_drag",) if ball.drag else ())
@@ -110,6 +66,7 @@ def test_own_coefficients_and_a_body_that_lacks_nothing(tmp_path):
     # One gravity of its own a ball would fit as well as drag, nearly; one of all does not.
     gravity = next(t for t in refined.search.rounds[0].trials if t.candidate.effect == "gravity_scale")
     assert any("heavy does not share it" in reason for reason in gravity.objections)
+    assert refined.search.rounds[0].candidates
     assert not any(c.effect.startswith("gravity_scale@") for c in refined.search.rounds[0].candidates)
     linear = next(t for t in refined.search.rounds[0].trials if t.candidate.effect == "linear_drag")
     assert any("it takes a medium of" in reason for reason in linear.objections)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from ring_scene import spheres_scene
-from test_fill import still
+from still import still
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig

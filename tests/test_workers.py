@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from flight import OMEGA, VELOCITY, observed, scene, small_simulation
 from small import SMALL
-from test_refine import FITTED, OMEGA, VELOCITY, observed, scene
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
@@ -24,13 +24,14 @@ from masiv.identify.neural.starting_law import choose_starting_laws, search_cost
 from masiv.models.base import Model
 from masiv.models.families import FAMILIES
 from masiv.models.filmed_body import FilmedBody
-from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import InitialState
-from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import ALL_FRAMES_STAGE, baselines, differentiated
+<<<<<<< HEAD
+=======
 from masiv.refine.config import RefineConfig
 from masiv.refine.prepare import prepare
+>>>>>>> w-models-next
 from masiv.refine.tasks import map_tasks, rank
 from masiv.workers import TaskError, Workers, process_count, unwrap
 
@@ -114,9 +115,9 @@ class Listening(Workers):
         super().__init__(1)
         self.heard = []
 
-    def map(self, function, tasks):
+    def map(self, function, tasks, *, shared=()):
         self.heard.append(list(tasks))
-        return super().map(function, self.heard[-1])
+        return super().map(function, self.heard[-1], shared=shared)
 
 
 def test_a_tensor_is_copied_to_a_process_and_its_memory_stays_where_it_is(two):
@@ -136,11 +137,13 @@ def test_results_come_in_order_and_a_failure_is_one_of_them(two):
     assert [f[0] for f in found[::2]] == [0, 1, 2, 3, 4]
     assert [f.reason for f in found[1::2]] == [f"{k} is odd" for k in (1, 3, 5, 7, 9)]
     assert os.getpid() not in {f[1] for f in found[::2]}
-    assert all(isinstance(f, TaskError) for f in Workers(1).map(halved, [(1,), (3,)]))
+    assert [isinstance(f, TaskError) for f in Workers(1).map(halved, [(1,), (3,)])] == [True, True]
 
 
 def test_bad_input_stays_bad_input(two):
-    for found in two.map(blamed, [(), ()]):
+    results = list(two.map(blamed, [(), ()]))
+    assert len(results) == 2
+    for found in results:
         with pytest.raises(InputError, match="no such effect"):
             unwrap(found)
 
@@ -227,7 +230,7 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
     listening = Listening()
     alone, beside = (choose_starting_laws(objective, throw, quiet, workers) for workers in (listening, two))
     assert len(alone) == 2
-    efforts = [search_cost(name, modulus) for _, _, name, _, _, modulus in listening.heard[1]]
+    efforts = [search_cost(name, modulus) for name, _, _, modulus in listening.heard[1]]
     assert efforts == sorted(efforts, reverse=True)  # or the longest search may begin last, alone
     for a, b in zip(alone, beside, strict=True):
         assert (a.material, a.contact, a.objective) == (b.material, b.contact, b.objective)
@@ -235,15 +238,18 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
             assert torch.equal(value, b.law.state_dict()[name])
 
 
+<<<<<<< HEAD
+=======
 def small_simulation():
     motion = observed({"linear_drag": [1.0]})
     first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
     config = RefineConfig(particles=200, samples_per_frame=1, laws=["neo_hookean"])
     contact = IdentifyConfig(contact="sticky")
-    setup, *_ = prepare("run", scene(), first, motion, contact, SimulatorConfig(), config)
+    setup, *_ = prepare("run", scene(), first, motion, contact, SMALL, config)
     return FreeBodyModel([setup]), config
 
 
+>>>>>>> w-models-next
 def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
     simulation, config = small_simulation()
     law = {"youngs_modulus": 2.5e4, "poissons_ratio": 0.31}

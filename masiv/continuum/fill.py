@@ -74,7 +74,7 @@ def fill_volume(
     """
     field = density_field(scene, dynamic, frame, config, volume=volume)
     if spacing is None:
-        spacing = (field.volume / config.particle_count) ** (1 / 3)
+        spacing = float((field.volume / config.particle_count) ** (1 / 3))
     points = even_points(field, spacing)
     if len(points) == 0:
         raise MasivError(
@@ -153,7 +153,8 @@ def even_points(field: DensityField, spacing: float) -> np.ndarray:
 
 def _main_pieces(solid: np.ndarray) -> np.ndarray:
     """The connected pieces of ``solid`` (I, J, K) bool that are not noise."""
-    labels, _ = ndimage.label(solid)
+    labels = np.empty(solid.shape, np.int32)
+    ndimage.label(solid, output=labels)
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
     return (sizes >= _SMALLEST_PIECE * sizes.max())[labels] & solid

@@ -96,7 +96,7 @@ def fine_tune(
         for group in optimiser.param_groups:
             group["lr"] = config.learning_rate * (0.02 + 0.49 * (1 + math.cos(math.pi * iteration / config.iterations)))
         terms = loss.terms(network, targets, np.random.default_rng([seed, iteration]))
-        total = sum(weights[name] * value for name, value in terms.items())
+        total = sum((weights[name] * value for name, value in terms.items()), torch.zeros(()))
         if not torch.isfinite(total):
             raise MasivError(
                 f"trajectory: the loss became non-finite at iteration {iteration}; lower trajectory.learning_rate"

@@ -127,7 +127,7 @@ def fill_first_frame(scene: Scene, dynamic: DynamicGaussians, config: Trajectory
 def positions_at(network: DeformationNetwork, start: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Positions (K, Q, 3) float32 [m] at ``times`` (K,) [s] of the points that are at ``start`` (Q, 3) at frame 0."""
     points = torch.as_tensor(np.asarray(start), dtype=torch.float32)
-    times = torch.as_tensor(np.asarray(times), dtype=torch.float32)
+    chunks = torch.as_tensor(np.asarray(times), dtype=torch.float32).split(_CHUNK)
     with torch.no_grad():
-        moved = [points + network.displacements(points, chunk) for chunk in times.split(_CHUNK)]
+        moved = [points + network.displacements(points, chunk) for chunk in chunks]
     return torch.cat(moved).numpy()

@@ -29,6 +29,9 @@ class DeformationNetwork(torch.nn.Module):
     upper limit, see ``time_octave_limit``). Raises InputError for values that are not finite or do not match.
     """
 
+    centre: torch.Tensor
+    spline: torch.Tensor
+
     def __init__(
         self,
         *,
@@ -74,8 +77,10 @@ class DeformationNetwork(torch.nn.Module):
         self.time_input = torch.nn.Linear(time_size, width, bias=False)
         self.coefficients = _mlp(width, width, depth - 1, bases)
         # No motion at first: the bases are zero. The weights differ, so that the bases can become different.
-        torch.nn.init.zeros_(self.motion[-1].weight)
-        torch.nn.init.zeros_(self.motion[-1].bias)
+        last = self.motion[-1]
+        assert isinstance(last, torch.nn.Linear)
+        torch.nn.init.zeros_(last.weight)
+        torch.nn.init.zeros_(last.bias)
 
     @property
     def frame_count(self) -> int:

@@ -60,7 +60,7 @@ def gaps(run: Run) -> dict[str, Any]:
 
 def _run(run: Run) -> dict[str, Any]:
     noise = run.noise_std
-    measured = "".join(axis for axis, known in zip("xyz", run.axes.any(axis=0), strict=True) if known)
+    measured = "".join(axis for axis, known in zip("xyz", np.asarray(run.axes.any(axis=0)), strict=True) if known)
     return {
         "name": run.name,
         "body": run.body,
@@ -181,5 +181,5 @@ def _draw_geometry(panel, tracks: Tracks, run: Run, a: int, b: int) -> None:
     if geometry is None or run.placement is None:
         return
     corners = run.placement.to_world(geometry.vertices)[geometry.faces][:, :, [a, b]]
-    panel.add_collection(PolyCollection(corners, facecolor="0.8", edgecolor="0.65", lw=0.2, alpha=0.5))
+    panel.add_collection(PolyCollection(list(corners), facecolor="0.8", edgecolor="0.65", lw=0.2, alpha=0.5))
     panel.autoscale_view()

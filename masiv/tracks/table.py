@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -116,13 +117,13 @@ def read_c3d(path: Path) -> Table:
     return Table(labels, positions, times, rate, name if name in ("m", "cm", "mm") else None)
 
 
-def _declared(columns: ColumnsDeclaration) -> tuple[dict[str, dict[str, str]], set[str], str | None]:
+def _declared(columns: ColumnsDeclaration) -> tuple[Mapping[str, Mapping[Any, str]], set[str], str | None]:
     layout = {marker: dict(axes) for marker, axes in columns.markers.items()}
     found = [_UNIT.search(column) for axes in layout.values() for column in axes.values()]
     return layout, {match["unit"] for match in found if match and match.group() != match.string}, columns.time
 
 
-def _by_name(path: Path, header: list[str]) -> tuple[dict[str, dict[str, str]], set[str], str | None]:
+def _by_name(path: Path, header: list[str]) -> tuple[Mapping[str, Mapping[Any, str]], set[str], str | None]:
     layout: dict[str, dict[str, str]] = {}
     units, time = set(), None
     for column in header:

@@ -79,12 +79,12 @@ class Run:
     @property
     def axes(self) -> np.ndarray:
         """Which axes of which marker were measured in any frame, (M, 3) bool."""
-        return np.isfinite(self.positions).any(axis=0)
+        return np.asarray(np.isfinite(self.positions).any(axis=0))
 
     @property
     def seen(self) -> np.ndarray:
         """Frames where a marker has all of its axes, (T, M) bool."""
-        return (np.isfinite(self.positions) | ~self.axes).all(axis=2) & self.axes.any(axis=1)
+        return np.asarray((np.isfinite(self.positions) | ~self.axes).all(axis=2) & self.axes.any(axis=1))
 
     def between(self, start: float, stop: float) -> Run:
         """The frames from ``start`` to ``stop`` [s]; what is known of rest and release stays."""

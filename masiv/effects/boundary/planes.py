@@ -24,7 +24,7 @@ class PlanesEffect(NodalEffect):
         )
 
 
-@functools.lru_cache(maxsize=16)
+@functools.cache
 def _planes_effect(kind: type[PlanesEffect], planes: int) -> PlanesEffect:
     """One object for each kind and number of planes: kernels are compiled for the object."""
     return kind(planes)

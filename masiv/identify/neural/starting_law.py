@@ -104,8 +104,8 @@ def choose_starting_laws(
     best = _best_moduli(objective, initial_state, materials, contacts[0], progress, workers)
     ranked = sorted(best, key=lambda name: best[name])[:SEARCHED_MATERIALS]
     slowest_first = sorted(ranked, key=lambda name: -search_cost(name, best[name][1]))
-    tasks = [(objective, initial_state, name, contacts, *best[name]) for name in slowest_first]
-    results = map(unwrap, workers.map(_search_scales, tasks))
+    tasks = [(name, contacts, *best[name]) for name in slowest_first]
+    results = map(unwrap, workers.map(_search_scales, tasks, shared=(objective, initial_state)))
     starts = {}
     for done, (name, (contact, log_factors, error)) in enumerate(zip(slowest_first, results, strict=True)):
         starts[name] = StartingLaw(name, contact, with_scales(_law(name), best[name][1], log_factors), error)
@@ -123,8 +123,8 @@ def _best_moduli(
 ) -> dict[str, tuple[float, float]]:
     """The least objective () of each material, and its modulus [Pa]. Raises MasivError if every rollout diverges."""
     moduli = [modulus * objective.problem.scene.density / 1000 for modulus in START_MODULI]
-    tasks = [(objective, initial_state, name, contact, moduli) for name in materials]
-    results = map(unwrap, workers.map(_objectives_of_moduli, tasks))
+    tasks = [(name, contact, moduli) for name in materials]
+    results = map(unwrap, workers.map(_objectives_of_moduli, tasks, shared=(objective, initial_state)))
     best: dict[str, tuple[float, float]] = {}
     for done, (name, errors) in enumerate(zip(materials, results, strict=True)):
         best[name] = min(zip(errors, moduli, strict=True))
