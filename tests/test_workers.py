@@ -27,11 +27,6 @@ from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
 from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import ALL_FRAMES_STAGE, baselines, differentiated
-<<<<<<< HEAD
-=======
-from masiv.refine.config import RefineConfig
-from masiv.refine.prepare import prepare
->>>>>>> w-models-next
 from masiv.refine.tasks import map_tasks, rank
 from masiv.workers import TaskError, Workers, process_count, unwrap
 
@@ -238,18 +233,6 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
             assert torch.equal(value, b.law.state_dict()[name])
 
 
-<<<<<<< HEAD
-=======
-def small_simulation():
-    motion = observed({"linear_drag": [1.0]})
-    first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
-    config = RefineConfig(particles=200, samples_per_frame=1, laws=["neo_hookean"])
-    contact = IdentifyConfig(contact="sticky")
-    setup, *_ = prepare("run", scene(), first, motion, contact, SMALL, config)
-    return FreeBodyModel([setup]), config
-
-
->>>>>>> w-models-next
 def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
     simulation, config = small_simulation()
     law = {"youngs_modulus": 2.5e4, "poissons_ratio": 0.31}
