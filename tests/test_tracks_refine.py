@@ -347,7 +347,7 @@ def test_what_tracks_refuse(tmp_path, masiv):
     masiv("identify", tmp_path, "--out", tmp_path / "run")
     for command, words in (
         (("refine", tmp_path / "run", "--condition", "load"), "--condition is for runs of one body"),
-        (("simulate", tmp_path / "run", "--frames", 9, "--without", "swirl"), "the twin has no such effect"),
+        (("simulate", tmp_path / "run", "--frames", 9, "--without", "swirl"), "effects that act on this twin are none"),
         (("simulate", tmp_path / "run", "--frames", 9, "--render"), "--render is for scenes of pictures"),
         (("evaluate", tmp_path / "run", "--truth", tmp_path), "--truth is for scenes of pictures"),
     ):
