@@ -21,7 +21,7 @@ from scipy.optimize import brentq, least_squares
 
 from masiv import runtime
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.marker_body import plan, simulated_body, simulated_markers
+from masiv.models.marked_body import marked_body
 from masiv.mpm.config import SimulatorConfig
 from masiv.tracks.declaration import GeometryDeclaration
 from masiv.tracks.geometry import make_geometry
@@ -104,13 +104,12 @@ def main() -> None:
             config = SimulatorConfig(particles_per_cell=asked.ppc, courant_number=courant, max_substeps_per_frame=2000)
             began = time.perf_counter()
             spacing = THICKNESS / cells / round(asked.ppc ** (1 / 3))
-            body = simulated_body(scene, scene.runs[0], config, particle_spacing=spacing)
-            planned = plan(body, law, times, config, speed=0.5)
-            tip = simulated_markers(body, law, times, config, speed=0.5)[:, 0, 0]
+            body = marked_body(scene, scene.runs[0], config, particle_spacing=spacing, speed=0.5)
+            tip = body.markers_to_world(body.run(law, times)[1])[:, 0, 0]
             hz, rate, amplitude = swing(times, tip, theory)
             print(json.dumps({
                 "cells": cells, "grid_mm": 1e3 * body.spacing, "particles": len(body.particles), "courant": courant,
-                "substep_us": 1e6 * planned.simulator.substep, "steps": planned.steps, "hz": hz,
+                "substep_us": 1e6 * body.substep(law, times), "hz": hz,
                 "hz_error": hz / theory - 1, "decay_per_s": rate, "amplitude_mm": 1e3 * amplitude,
                 "seconds": time.perf_counter() - began,
             }), flush=True)  # fmt: skip

@@ -110,7 +110,7 @@ def ball_scene(source: Path):
 def balls(source: Path) -> dict:
     """What refine finds in the ball drops, and what one free gravity a ball would have looked like."""
     from masiv.inference.model_fit import gauss_newton_fit
-    from masiv.models.free_body import Model
+    from masiv.models.base import Model
     from masiv.refine.config import RefineConfig
     from masiv.refine.from_tracks import refine_group
     from masiv.refine.search_state import SearchSettings
@@ -173,7 +173,7 @@ def damping(
 
     from masiv.effects.catalogue import effect_named
     from masiv.materials.classical import ClassicalLaw
-    from masiv.models.marker_body import simulated_body, simulated_markers
+    from masiv.models.marked_body import marked_body
     from masiv.mpm.config import SimulatorConfig
     from masiv.tracks.read import read_tracks
 
@@ -188,11 +188,12 @@ def damping(
         hz, rate, amplitude = swing(seen.elapsed, seen.positions[:, 0, 0], 7.5)
         rows.append({"measured": name, "hz": hz, "decay_per_s": rate, "amplitude_mm": 1e3 * amplitude})
     for count in particles:
-        body = simulated_body(tracks, tracks.runs[0], config, particle_spacing=(9e-5 / count) ** (1 / 3))
+        body = marked_body(tracks, tracks.runs[0], config, particle_spacing=(9e-5 / count) ** (1 / 3), speed=0.3)
         for eta in (0.0, viscosity):  # a fine grid and much viscosity need a smaller Courant number
             began = time.perf_counter()
             members = ((effect_named("viscosity"), torch.tensor([eta])),)
-            tip = simulated_markers(body, law, times, config, members, speed=0.3)[:, 0, 0]
+            acting = body.effects(members, body.context(float(times[-1]), float(times[-1]) / (len(times) - 1)))
+            tip = body.markers_to_world(body.run(law, times, acting)[1])[:, 0, 0]
             hz, rate, amplitude = swing(times[12:], tip[12:], 7.5)
             rows.append({
                 "particles": len(body.particles), "grid_mm": 1e3 * body.spacing, "viscosity": eta, "hz": hz,
@@ -205,9 +206,10 @@ def damping(
 def load(source: Path, youngs: float, viscosity: float, particles: int, courant: float, what: list[str]) -> list[dict]:
     """The loaded beam with one effect at the middle of its end, law and viscosity known: what is left of load52_a, from
     0.1 to 0.6 s after its release, and of load52_b, which is held out."""
-    from masiv.identify.tracks import family_of, simulation_of
+    from masiv.identify.tracks import simulation_of
     from masiv.inference.model_fit import gauss_newton_fit
-    from masiv.models.free_body import Model
+    from masiv.models.base import Model
+    from masiv.models.families import family_of
     from masiv.mpm.config import SimulatorConfig
     from masiv.tracks.config import TracksConfig
     from masiv.tracks.read import read_tracks

@@ -28,8 +28,8 @@ def told(simulation, starts: Sequence, law: str, contact: str, parameters: Mappi
     """
     from masiv.errors import MasivError
     from masiv.inference.model_fit import gauss_newton_fit
+    from masiv.models.base import Model, effect_parameters
     from masiv.models.families import FAMILIES
-    from masiv.models.free_body import Model, effect_parameters
 
     model = Model(FAMILIES[law], contact, tuple(effects))
     true = {p.name: effects[n][p.name.split(".")[1]] for n in effects for p in effect_parameters(n)}

@@ -87,31 +87,31 @@ def cases():
     return sorted(out, key=lambda case: case.law != "neo_hookean" or case.name.endswith("_stiff"))
 
 
-def reset_initial_conditions(case, config):
+def baseline_fits(case, config):
     """Simulation, experiment, and fits of laws without effects."""
     import torch
     from track_cases import observed
 
     from masiv.checkpoint import Checkpoint
     from masiv.identify.config import IdentifyConfig
-    from masiv.models.free_body import Simulation
-    from masiv.models.prepare import video_observation
+    from masiv.models.free_body import FreeBodyModel
     from masiv.mpm.config import SimulatorConfig
     from masiv.observations.motion import SampledMotion
     from masiv.refine.baselines import BaselineProblem, baselines
+    from masiv.refine.prepare import prepare
     from masiv.workers import Workers
 
     torch.set_num_threads(1)
     scene, motion = observed(case)
     whole = SampledMotion(motion.positions, motion.times, motion.volume)
     cut = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
-    observation, coarse, coarser, initial_motion = video_observation(
+    setup, coarse, coarser, initial_motion = prepare(
         "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
     )
-    simulation = Simulation([observation])
-    problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.frames))
+    simulation = FreeBodyModel([setup])
+    problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.problem.frames))
     fits = baselines(simulation, problem, config, Checkpoint(None), quiet, Workers())
-    return simulation, observation, fits
+    return simulation, setup.observation, fits
 
 
 def told_of(case, config):
@@ -119,14 +119,15 @@ def told_of(case, config):
     from oracle import told
 
     from masiv.inference.discretization import with_residual_std
-    from masiv.models.free_body import Simulation
+    from masiv.models.free_body import FreeBodyModel
 
     began = time.time()
-    simulation, _, fits = reset_initial_conditions(case, config)
+    simulation, _, fits = baseline_fits(case, config)
     observation_std = [e.residual_std for e in simulation.observations]
     best = min(fits, key=lambda f: f.cost)
     simulation = with_residual_std(simulation, best, observation_std)
-    own = Simulation(simulation.observations)  # with substeps that the true stiffness asks for
+    own = FreeBodyModel(simulation.setups)  # with substeps that the true stiffness asks for
+    own = own.with_observations(simulation.observations)
     best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
     own = with_residual_std(own, best, observation_std)
     best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
@@ -139,7 +140,7 @@ def refined(case, config):
     from masiv.refine.stage import refine
 
     began = time.time()
-    simulation, observation, fits = reset_initial_conditions(case, config)
+    simulation, observation, fits = baseline_fits(case, config)
     middle = time.time()
     refined = refine(simulation, fits, SearchSettings.of(config))
     end = time.time()

@@ -29,6 +29,7 @@ RENAMED_KEYS = {
     "trajectory.carve_misses": "carve_images",
     "trajectory.batch": "batch_size",
     "trajectory.match_every": "match_interval",
+    "simulator.split": "subparticles",
     "identify.polish": "surface_finetune",
     "identify.polish_silhouette_weight": "finetune_silhouette_weight",
     "identify.paint_weight": "color_weight",

@@ -40,7 +40,7 @@ class Request:
 
     config: Mapping[str, Any]
     scene_path: Path
-    scene: Mapping[str, Any]  # masiv.scene.summary.identity
+    scene: Mapping[str, Any]  # masiv.observations.identity.identity
     fit_frames: int
     holdout_cameras: tuple[int, ...] = ()
 

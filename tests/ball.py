@@ -8,9 +8,8 @@ from small import SMALL
 from test_identify import Seen
 
 from masiv.continuum.fill import DensityField, even_points
-from masiv.identify.config import IdentifyConfig
 from masiv.identify.losses.images import ImageTerms
-from masiv.models.problem import Problem
+from masiv.models.filmed_body import FilmedBody
 from masiv.scene.scene import Scene
 
 CENTRE, RADIUS, FRAMES = np.array([0.0, 0.45, 0.0]), 0.25, 2
@@ -30,4 +29,4 @@ def ball_terms(scene: Scene, spacing: float) -> ImageTerms:
     points = even_points(DensityField(inside, CENTRE - 0.3, step), spacing)
     still = np.repeat(points[None], FRAMES, axis=0).astype(np.float32)
     seen = Seen(still, np.arange(FRAMES) / scene.fps, len(points) * spacing**3)
-    return ImageTerms(Problem(scene, seen, IdentifyConfig(), SMALL), with_colors=True)
+    return ImageTerms(FilmedBody(scene, seen, SMALL, samples=2), with_colors=True)

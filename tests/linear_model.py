@@ -6,52 +6,20 @@ to be found is known.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.inference.model_fit import gauss_newton_fit
-from masiv.models.base import EffectTerm, SharedRollouts, WeightedResidual
+from masiv.models.base import EffectTerm, ForwardModel, Model
 from masiv.models.families import Family
-from masiv.models.free_body import Model
 from masiv.models.parameters import Parameter
+from masiv.observations.base import Observation
 
 INSTANTS, FITTED, COUNT = 40, 30, 30
 TIMES = np.linspace(0.0, 1.0, INSTANTS)
 POINTS = np.random.default_rng(7).uniform(-0.2, 0.2, (COUNT, 3))
 NOISE = 1e-3
 """Standard deviation [m] of a point's distance from where it is."""
-
-
-@dataclass(frozen=True)
-class LinearObservation(WeightedResidual):
-    """values (T, N, 3) [m] of the points."""
-
-    values: np.ndarray
-    residual_std: np.ndarray
-    noise_std: float = NOISE
-    name: str = "a"
-    fit_count: int = FITTED
-    holds_out: bool = True
-    points: np.ndarray = field(default_factory=lambda: POINTS)
-    times: np.ndarray = field(default_factory=lambda: TIMES)
-    grid_changes: tuple[np.ndarray, ...] = ()
-
-    @property
-    def time_count(self) -> int:
-        return len(self.times)
-
-    @property
-    def points_in_world(self) -> np.ndarray:
-        return self.points
-
-    @property
-    def values_in_world(self) -> np.ndarray:
-        return self.values
-
-    def field_in_world(self, residual: np.ndarray) -> np.ndarray:
-        return residual
 
 
 def pattern(axis: int, in_time: np.ndarray, in_space: np.ndarray) -> np.ndarray:
@@ -71,7 +39,7 @@ EFFECTS = {
 """Patterns (T, N, 3) [m] of unit strength. Names of the library, so that what is known of them holds."""
 
 
-class LinearModel(SharedRollouts):
+class LinearModel(ForwardModel):
     """A velocity along z, and effects that move the points by strength times pattern.
 
     truth: strengths that are there; exclusive: of two of these a model has one at most; diverges: effects that cannot
@@ -79,11 +47,14 @@ class LinearModel(SharedRollouts):
     """
 
     def __init__(self, truth, *, seed=0, exclusive=(), diverges=(), noise=NOISE, name="a", effects=EFFECTS):
-        super().__init__()
         self.exclusive, self.diverges, self.effects = exclusive, diverges, dict(effects)
         random = np.random.default_rng(seed)
         values = self.motion(truth) + random.normal(0.0, noise / np.sqrt(3), (INSTANTS, COUNT, 3))
-        self.observations = (LinearObservation(values, np.full(INSTANTS, NOISE), name=name),)
+        observation = Observation(
+            name=name, times=TIMES, points=POINTS, values=values, fit_count=FITTED, noise_std=NOISE,
+            residual_std=np.full(INSTANTS, NOISE),
+        )  # fmt: skip
+        super().__init__([observation])
 
     def motion(self, values):
         out = pattern(2, TIMES, values.get("velocity_z", 0.0) * ONES)
@@ -111,25 +82,6 @@ class LinearModel(SharedRollouts):
         self.rollouts += 1
         stop = None if held_out else FITTED
         return [(self.motion(values) - e.values)[:stop] for e in self.observations]
-
-    def residual(self, model, values):
-        found = zip(self.observations, self.fields(model, values), strict=True)
-        return np.concatenate([e.whiten(f).ravel() for e, f in found])
-
-    def finer_grids(self, model, values, index):
-        return []
-
-    def reset_initial_conditions(self, values):
-        return dict(values)
-
-    def curriculum(self, base):
-        return ()
-
-    def is_out_of_phase(self, base):
-        return False
-
-    def objections(self, before, after, term, config):
-        return []
 
 
 def baseline(forward_model, effects=()):

@@ -8,5 +8,5 @@ from __future__ import annotations
 from masiv.mpm.config import SimulatorConfig
 
 SUBSTEPS, NODES = 64, 1 << 16
-SMALL = SimulatorConfig(split=1, grid_nodes=NODES, memory_mb=16)
+SMALL = SimulatorConfig(subparticles=1, grid_nodes=NODES, memory_mb=16)
 """Memory for as many substeps in float32."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import get_args
 
 import pytest
 
@@ -58,7 +59,11 @@ def test_keys_of_earlier_versions_are_read(tmp_path, old):
     section, key = old.split(".")
     new = RENAMED_KEYS[old]
     default = getattr(getattr(Config(), section), new)
-    value = not default if isinstance(default, bool) else 0.25 if isinstance(default, float) else 151
+    choices = get_args(type(getattr(Config(), section)).model_fields[new].annotation)
+    value = not default if isinstance(default, bool) else 151
+    if isinstance(default, float):
+        value = 0.3 if default <= 1 else (default + 1) / 2  # within the bounds of every key
+    value = choices[0] if choices else value
     from_file = load_config(None, write(tmp_path, f"{section}: {{{key}: {value}}}"))
     assert getattr(getattr(from_file, section), new) == value
     assert load_config(base={section: {key: value}}) == from_file

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,30 +10,30 @@ import pytest
 
 from masiv.inference.discretization import with_grid_errors, with_residual_std
 from masiv.inference.model_fit import ModelFit
-from masiv.models.base import SharedRollouts, WeightedResidual
+from masiv.models.base import ForwardModel
 from masiv.models.parameters import Parameter
+from masiv.observations.base import Observation
 
 INSTANTS, ROWS, POINTS = 6, 4, 5
 NOISE = 1e-3
 
 
-@dataclass(frozen=True)
-class Observation(WeightedResidual):
-    noise_std: float = NOISE
-    residual_std: np.ndarray = None
-    time_count: int = INSTANTS
-    fit_count: int = ROWS
-    holds_out: bool = True
-    grid_changes: tuple[np.ndarray, ...] = ()
-
-
-class Changing(SharedRollouts):
+class Changing(ForwardModel):
     """Finer grids make ``changes`` (T, N, 3) [m]."""
 
     def __init__(self, *changes):
-        super().__init__()
         self.changes = changes
-        self.observations = (Observation(residual_std=np.full(INSTANTS, NOISE)),)
+        observation = Observation(
+            name="0", times=np.arange(INSTANTS) / 24, points=np.zeros((POINTS, 3)),
+            values=np.zeros((INSTANTS, POINTS, 3)), fit_count=ROWS, noise_std=NOISE,
+            residual_std=np.full(INSTANTS, NOISE),
+        )  # fmt: skip
+        super().__init__([observation])
+
+    def parameters(self, model):
+        raise NotImplementedError
+
+    candidates = term = fields = parameters
 
     def finer_grids(self, model, values, index):
         return list(self.changes)
@@ -57,14 +57,14 @@ def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
         given = Changing(*changes)
         updated = with_residual_std(given, fitted, [np.full(INSTANTS, NOISE)])
         np.testing.assert_array_equal(given.observations[0].residual_std, NOISE)  # the given one stays as it is
-        assert given.observations[0].grid_changes == ()
+        assert given.observations[0].grid_corrections == ()
         return updated.observations[0]
 
     np.testing.assert_allclose(found(absorbed, 2 * absorbed).residual_std, NOISE, rtol=1e-6)
     common, apart = 3e-2 * random.normal(size=shape), 1e-2 * random.normal(size=shape)
     alike = found(common, 1.2 * common + absorbed)
     np.testing.assert_allclose(alike.residual_std, NOISE, rtol=1e-6)
-    np.testing.assert_array_equal(alike.grid_changes, [common, 1.2 * common + absorbed])
+    np.testing.assert_array_equal(alike.grid_corrections, [common, 1.2 * common + absorbed])
     differing = found(common + apart, common - apart)
     rms = np.sqrt((apart**2).sum(2).mean(1))
     # A third grid is off the mean of two by the square root of three times as much as they are.
@@ -78,7 +78,7 @@ def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
     np.testing.assert_array_equal(
         found(common + apart, common - apart, fitted=again).residual_std, differing.residual_std
     )
-    assert found().grid_changes == ()
+    assert found().grid_corrections == ()
     np.testing.assert_array_equal(found().residual_std, NOISE)
 
 
@@ -97,7 +97,7 @@ def test_standard_errors_hold_what_one_more_grid_would_move():
     fitted = ModelFit(None, values, tuple(params), np.zeros(len(jacobian)), columns, 1.0, 9, 1.0, 1.0, [], errors)
     assert with_grid_errors(observations, fitted, 1.0) is fitted  # no grid is known to change anything
     changes = (common + apart, common - apart)
-    observations = (replace(observations[0], grid_changes=changes),)
+    observations = (replace(observations[0], grid_corrections=changes),)
     found = with_grid_errors(observations, fitted, 1.0).stderr
     # The mean's own size is what its share is for; a third grid is off it by the square root of three times as much.
     assert found[share.name] == pytest.approx(errors[share.name])

@@ -22,8 +22,8 @@ from masiv.identify.neural.starting_law import (
 from masiv.identify.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, estimate_initial_motion
-from masiv.models.problem import Problem
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.simulate import simulate
@@ -139,10 +139,10 @@ def test_fit_explains_and_predicts_a_motion_it_was_not_told_the_law_of(seen):
 
 
 def test_no_starting_law_is_stiffer_than_a_motion_determines(seen):
-    problem = Problem(scene(), seen[0], settings(), SMALL, chosen=np.arange(0, len(seen[0].positions[0]), 4))
+    problem = FilmedBody(scene(), seen[0], SMALL, samples=2, chosen=np.arange(0, len(seen[0].positions[0]), 4))
     motion = InitialState.of_world(problem.axes, VELOCITY, OMEGA)
     errors = [
-        objective_of_start(Objective(problem), motion, "jelly", "sticky", factor * MAX_START_MODULUS)
+        objective_of_start(Objective(problem, settings()), motion, "jelly", "sticky", factor * MAX_START_MODULUS)
         for factor in (0.5, 1.01)
     ]
     assert errors[0] < DIVERGED  # it could be simulated, and so could the stiffer one

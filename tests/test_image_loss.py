@@ -21,8 +21,8 @@ def terms(request):
 def error(terms, scale):
     """Silhouette error of the ball, scaled by ``scale`` about its centre."""
     problem = terms.problem
-    middle = problem.start.mean(0)
-    points = middle + scale * (problem.start - middle)
+    middle = problem.particles.mean(0)
+    points = middle + scale * (problem.particles - middle)
     pictures = [(1, view) for view in problem.scene.views]
     return float(terms.errors(points.expand(problem.samples, -1, -1), pictures)[0])
 
@@ -42,7 +42,7 @@ def test_a_body_of_the_right_size_is_best(terms):
 
 def test_as_many_pixels_as_the_masks(terms):
     problem = terms.problem
-    points, excess = to_world(problem, problem.start), []
+    points, excess = to_world(problem, problem.particles), []
     for view in problem.scene.views:
         window = picture_window(problem.scene, view, 0)
         with torch.no_grad():

@@ -21,8 +21,9 @@ DRIFT = np.array([0.25, 0.0, 0.0])
 """[m/s]"""
 
 
-def values_of(problem, **changes):
-    start = initial_state_parameters(InitialState.of_world(problem.axes, VELOCITY, OMEGA), problem.ground_range)
+def values_of(objective, **changes):
+    state = InitialState.of_world(objective.problem.axes, VELOCITY, OMEGA)
+    start = initial_state_parameters(state, objective.ground_range)
     return {**TRUE, **{p.name: p.start for p in start}, **changes}
 
 
@@ -30,10 +31,10 @@ def test_paths_come_first_and_are_metres_again(filmed, seen):  # noqa: F811
     objective = objective_of(filmed, seen, samples_per_frame=2)
     problem = objective.problem
     plain, both = (JointResidual(objective, FAMILIES["neo_hookean"], "sticky", 3, with_images=w) for w in (False, True))
-    paths, squared = both(values_of(problem))
+    paths, squared = both(values_of(objective))
     assert paths.shape == (6, problem.count, 3)
     np.testing.assert_allclose(both.path_part(squared), paths.ravel(), rtol=1e-6)
-    alone, flat = plain(values_of(problem))
+    alone, flat = plain(values_of(objective))
     np.testing.assert_array_equal(alone, paths)
     np.testing.assert_array_equal(flat, paths.ravel())
     rows = np.random.default_rng(0).normal(size=(len(squared), 2))
@@ -48,7 +49,7 @@ def test_pictures_are_nearest_at_the_truth(filmed, seen):  # noqa: F811
     joint = JointResidual(objective, FAMILIES["neo_hookean"], "sticky", problem.frames, with_images=True)
 
     def of_pictures(**changes):
-        _, squared = joint(values_of(problem, **changes))
+        _, squared = joint(values_of(objective, **changes))
         return float((squared[joint.path_rows :] ** 2).sum())
 
     here = of_pictures()

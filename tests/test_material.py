@@ -18,8 +18,8 @@ from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.mpm.rollout import at_rest
 from masiv.pretraining.pretrain import MATERIALS, pretrained_path
-from masiv.report.material import material_section, read_material
 from masiv.report.page import Page
+from masiv.report.sections.material import material_section, read_material
 
 SEEN = Excited((0.0005, 0.03), (0.001, 0.3), (-0.01, 0.005), 5.0)
 

@@ -18,8 +18,8 @@ WRONG = {"viscosity": 40.0, "bulk_modulus": 1e5}
 
 
 def fitted(objective, kind, values, mean_square):
-    problem = objective.problem
-    start = initial_state_parameters(InitialState.of_world(problem.axes, VELOCITY, OMEGA), problem.ground_range)
+    state = InitialState.of_world(objective.problem.axes, VELOCITY, OMEGA)
+    start = initial_state_parameters(state, objective.ground_range)
     every = {**values, **{p.name: p.start for p in start}}
     return FamilyFit(kind, "sticky", every, mean_square=mean_square, samples=100)
 

@@ -12,8 +12,8 @@ from masiv.identify.neural.starting_law import StartingLaw
 from masiv.identify.neural.training import TrainingResult
 from masiv.identify.recording import FitRecording
 from masiv.materials.neural import NeuralLaw
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.progress import silent
 
 
@@ -22,8 +22,9 @@ def fit(seen, monkeypatch, errors, objectives, image_losses=None):  # noqa: F811
     diverges; image_losses: after the surface finetune of each, None without such a finetune."""
     fitted, laws = [], {name: NeuralLaw(seed=k) for k, name in enumerate(errors)}
     changes = {"surface_finetune": image_losses is not None, "pictures": 1}
-    problem = Problem(scene(), seen[0], settings(**changes), SMALL)
-    objective = Objective(problem)
+    config = settings(**changes)
+    problem = FilmedBody(scene(), seen[0], SMALL, samples=config.samples_per_frame)
+    objective = Objective(problem, config)
     monkeypatch.setattr(Objective, "has_surface_finetune", image_losses is not None)
 
     def train(recordings, law, *_, **__):

@@ -53,7 +53,7 @@ def errors(terms, angles):
     problem = terms.problem
     pictures, found = [(1, view) for view in problem.scene.views], []
     for angle in angles:
-        points = problem.axes.points_to_simulation(turned(to_world(problem, problem.start).double().numpy(), angle))
+        points = problem.axes.points_to_simulation(turned(to_world(problem, problem.particles).double().numpy(), angle))
         positions = torch.as_tensor(points, dtype=torch.float32).expand(problem.samples, -1, -1)
         found.append([float(e) for e in terms.errors(positions, pictures)])
     return np.array(found)
@@ -81,7 +81,7 @@ def test_the_derivative_equals_finite_differences(terms):
     """Along the turn, at a ball that is 5 degrees behind."""
     problem = terms.problem
     behind, step = TURN - np.deg2rad(5), np.deg2rad(0.5)
-    points = to_world(problem, problem.start).double().numpy()
+    points = to_world(problem, problem.particles).double().numpy()
     now = torch.as_tensor(turned(points, behind), dtype=torch.float32).requires_grad_()
     window = picture_window(problem.scene, 2, 1)
     color_correlation_loss(terms.colors, now, window).backward()
@@ -93,7 +93,7 @@ def test_the_derivative_equals_finite_differences(terms):
 
 def test_particles_that_no_camera_sees_have_no_color(terms):
     problem = terms.problem
-    points = to_world(problem, problem.start).double().numpy()
+    points = to_world(problem, problem.particles).double().numpy()
     depth = RADIUS - np.linalg.norm(points - CENTRE, axis=1)
     known = terms.colors.channels[:, 2].numpy() > 0
     assert known[depth < 0.02].mean() > 0.9

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.inference.robust import soft_l1_mean_square
-from masiv.models.base import EffectTerm, WeightedResidual
-from masiv.models.free_body import Model
+from masiv.models.base import EffectTerm, ForwardModel, Model
 from masiv.models.parameters import Parameter
+from masiv.observations.base import Observation
 from masiv.refine.candidates import score
 from masiv.refine.effect_fit import fit_with_effect
 
@@ -21,25 +19,18 @@ BARE, LOAD = 7.7, 2.2
 AXES = np.eye(3)
 
 
-@dataclass(frozen=True)
-class Seen(WeightedResidual):
-    residual_std: np.ndarray
-    points: np.ndarray
-    noise_std: float = 1e-5
-    name: str = "a"
-    time_count: int = len(TIMES)
-    fit_count: int = len(TIMES)
-    holds_out: bool = False
-
-
-class Swing:
+class Swing(ForwardModel):
     """Two markers on a bar that swings about its sag; ``mass`` at ``place`` (0: the clamp, 1: the tip) slows it and
     adds to the sag, ``push`` (two components) only moves it."""
 
     def __init__(self, out_of_phase):
         self.out_of_phase = out_of_phase
-        self.observations = (Seen(np.full(len(TIMES), 1e-5), np.zeros((2, 3))),)
         self.observed = self.motion({"mass.mass": LOAD, "mass.place": 1.0})
+        observation = Observation(
+            name="a", times=TIMES, points=np.zeros((2, 3)), values=self.observed, fit_count=len(TIMES), noise_std=1e-5,
+            residual_std=np.full(len(TIMES), 1e-5),
+        )  # fmt: skip
+        super().__init__([observation])
 
     def motion(self, values):
         load, place = values.get("mass.mass", 0.0), values.get("mass.place", 1.0)
@@ -67,10 +58,7 @@ class Swing:
     def fields(self, model, values, *, held_out=False):
         return [self.motion(values) - self.observed]
 
-    def residual(self, model, values):
-        return self.fields(model, values)[0].ravel()
-
-    def is_out_of_phase(self, base):
+    def is_out_of_phase(self, fields):
         return self.out_of_phase
 
 

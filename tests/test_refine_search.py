@@ -1,180 +1,246 @@
-"""What the search of causes tries again, and what it does not try."""
+"""What a search of effects decides, on a forward model in closed form whose truth is known."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from linear_model import EFFECTS, NOISE, ONES, POINTS, TIMES, LinearModel, baseline, pattern
 
-from masiv.models.base import EffectTerm
-from masiv.models.parameters import Parameter
-from masiv.refine import add_effect, second_effect
-from masiv.refine import search as loop
+from masiv.errors import InputError, MasivError
+from masiv.inference.model_fit import gauss_newton_fit
+from masiv.models.families import Family
+from masiv.models.free_body import Model
+from masiv.refine.candidates import score
 from masiv.refine.config import RefineConfig
-from masiv.refine.rounds import Round, Trial
-from masiv.workers import Workers
+from masiv.refine.document import document, text
+from masiv.refine.effect_fit import fit_with_effect
+from masiv.refine.rounds import Trial
+from masiv.refine.search import DISCREPANCY_FORCE, whitened_start
+from masiv.refine.search_round import could_improve
+from masiv.refine.search_state import SearchSettings
+from masiv.refine.stage import refine
 
-NUMBERS = {"ground_height": 1, "linear_drag": 1, "restitution": 1, "point_mass": 4, "body_force": 3}
-KINKED = ("restitution",)
-LAW = SimpleNamespace(kind="neo_hookean")
-
-
-class Library:
-    """Knows terms and nothing else."""
-
-    observations = ()
-
-    def term(self, name):
-        own = tuple(Parameter(f"{name}.{k}", 0.0, 0.0, 1.0, 0.1) for k in range(NUMBERS[name]))
-        return EffectTerm(name, name, own, (), ((),), {}, nonsmooth=name in KINKED)
-
-    def candidates(self, model):
-        return [n for n in NUMBERS if n not in model.effects]
+DRAG, GRAVITY = {"linear_drag.strength": 0.5}, {"gravity_scale.strength": 0.4}
 
 
-def fit(*effects, cost=1.0):
-    numbers = [None] * (9 + sum(NUMBERS[n] for n in effects))
-    return SimpleNamespace(
-        model=SimpleNamespace(family=LAW, effects=effects), cost=cost, parameters=numbers,
-        samples=100, bic=lambda samples: cost,
-    )  # fmt: skip
+def settings(config=None, **changes):
+    return SearchSettings.of(RefineConfig.model_validate(config or {}), discrepancy_force=False, **changes)
 
 
-def trial(name, **changes):
-    return Trial(SimpleNamespace(effect=name), fit(name, **changes))
+def refined(model, config=None, known=(), **changes):
+    return refine(model, [baseline(model, known)], settings(config, **changes))
 
 
-@pytest.mark.parametrize(
-    ("rival", "beside_rival"),
-    [
-        ("point_mass", {"linear_drag", "restitution"}),
-        ("linear_drag", {"ground_height", "restitution"}),
-    ],
-)
-def test_a_rival_of_many_numbers_is_not_tried_beside_the_accepted_cause(rival, beside_rival, monkeypatch):
-    looked = {}
-
-    def ranked(workers, simulation, base, *, robust_scale, names, progress):
-        looked[base.model.effects] = set(names)
-        return []
-
-    monkeypatch.setattr(second_effect, "ranked", ranked)
-    monkeypatch.setattr(second_effect, "warm_started_fit", lambda simulation, fitted, robust_scale: fitted)
-    current = fit("ground_height")
-    first = Round(current, [], [trial("ground_height"), trial(rival)], None, {})
-    second_effect.search_second_effect(Library(), current, first, 1.0, RefineConfig(), lambda *_: None, Workers())
-    assert looked == {("ground_height",): {"linear_drag", "restitution"} - {"ground_height"}, (rival,): beside_rival}
+@pytest.mark.parametrize("seed", range(8))
+def test_nothing_is_missing_if_nothing_is(seed):
+    result = refined(LinearModel({"velocity_z": 0.3}, seed=seed))
+    assert (result.verdict, result.accepted, result.changes_twin) == ("nothing missing", (), False)
+    assert result.reduced_chi(result.after) == pytest.approx(1.0, abs=0.1)
 
 
-def test_what_is_simpler_or_has_a_kink_is_fitted_again_from_where_the_best_ended(monkeypatch):
-    again = []
-
-    def map_tasks(workers, simulation, function, tasks):
-        for _, name, best, _ in tasks:
-            again.append(name)
-            assert best.model.effects == ("linear_drag",)
-            yield fit(name, cost=0.5)
-
-    monkeypatch.setattr(loop, "map_tasks", map_tasks)
-    trials = [trial("linear_drag"), trial("ground_height", cost=2.0), trial("restitution", cost=2.0),
-              trial("point_mass", cost=2.0)]  # fmt: skip
-    loop._refit_simpler_candidates(Library(), trials, 1.0, lambda *_: None, Workers())
-    assert again == ["restitution"]
-    assert [t.fitted.cost for t in trials] == [1.0, 2.0, 0.5, 2.0]
+@pytest.mark.parametrize("seed", range(4))
+def test_an_effect_within_the_noise_is_not_named(seed):
+    weak = LinearModel({"viscosity.strength": 0.05 * NOISE}, seed=seed)
+    assert refined(weak, {"noise_threshold": 0}).accepted == ()
 
 
-@pytest.mark.parametrize(("log_predictive_gain", "first"), [(9.0, "neo_hookean"), (2.0, "von_mises")])
-def test_residuals_are_weighed_by_the_law_that_foretells_the_motion(log_predictive_gain, first, monkeypatch):
-    """A plastic law fits a viscous body's first frames best; whether it is the base, the frames after them say."""
-    noise, with_residual_std = 1e-3, []
-
-    def law(kind, fitted, held_out):
-        found = fit(cost=fitted * noise**2)
-        found.model = SimpleNamespace(family=SimpleNamespace(kind=kind), effects=())
-        found.squares, found.values = [noise**2 * np.array([fitted, fitted, held_out])], {}
-        return found
-
-    baselines = [law("von_mises", 1.0, log_predictive_gain), law("neo_hookean", 1.9, 3.0)]
-    simulation = Library()
-    simulation.observations = (
-        SimpleNamespace(residual_std=np.full(3, noise), noise_std=noise, fit_count=2, holds_out=True, time_count=3),
-    )  # fmt: skip
-    simulation.residual = lambda model, values: np.full(8, noise)
-    monkeypatch.setattr(
-        loop, "update_residual_std", lambda _, fitted, __: with_residual_std.append(fitted.model.family.kind)
-    )
-    monkeypatch.setattr(loop, "map_tasks", lambda *_: iter(baselines))
-    rivals, _ = loop._weighed_baselines(simulation, baselines, [], RefineConfig(), lambda *_: None, Workers())
-    assert [f.model.family.kind for f in rivals] == sorted(["neo_hookean", "von_mises"], key=lambda k: k != first)
-    assert with_residual_std == (["von_mises"] if first == "von_mises" else ["von_mises", "neo_hookean"])
+@pytest.mark.parametrize("discrepancy_force", [False, True])
+def test_two_strong_effects_are_found_by_every_kind_of_search(discrepancy_force):
+    """A search without a force for the discrepancy, as tracks have it, goes on after the first effect, too."""
+    model = LinearModel({**DRAG, **GRAVITY, "velocity_z": 0.3})
+    result = refine(model, [baseline(model)], replace(settings(), discrepancy_force=discrepancy_force))
+    assert {t.name for t in result.accepted} == {"linear_drag", "gravity_scale"}
+    assert result.verdict == "effect added"
+    assert result.after.values["linear_drag.strength"] == pytest.approx(0.5, abs=1e-3)
+    assert result.after.values["gravity_scale.strength"] == pytest.approx(0.4, abs=1e-3)
+    assert result.reduced_chi(result.after) == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("best", "ends", "kept"),
-    [
-        (0.1, 0.12, 0.12),  # it was a minimum that was none
-        (0.1, 1.5, 1.0),  # the cause did help
-        (0.6, 0.1, 1.0),  # which is not asked where it helped little
-    ],
-)
-def test_what_an_effect_helped_out_of_is_left_without_it(best, ends, kept, monkeypatch):
-    reset_initial_conditions = []
-
-    def gauss_newton_fit(simulation, model, values, **_):
-        reset_initial_conditions.append(values)
-        return fit("ground_height", cost=ends)
-
-    monkeypatch.setattr(loop, "gauss_newton_fit", gauss_newton_fit)
-    monkeypatch.setattr(loop, "held_in", lambda *_: frozenset())
-    base, richer = fit("ground_height"), fit("ground_height", "point_mass", cost=best)
-    base.values, richer.values = {"height": 0.1, "offset": 3.0}, {"height": 0.2, "mass": 5.0}
-    assert loop._restart_base(Library(), base, richer, 1.0).cost == kept
-    assert reset_initial_conditions == ([{"height": 0.2, "offset": 3.0}] if best < 0.5 else [])
+def test_no_more_effects_are_added_than_asked_and_the_rest_is_called_unexplained():
+    result = refined(LinearModel({**DRAG, **GRAVITY}), {"max_effects": 1})
+    assert [t.name for t in result.accepted] == ["gravity_scale"]
+    assert result.verdict == "unexplained residual"
+    written = document(result)
+    assert written["verdict"] == "unexplained residual"
+    assert [a["effect"] for a in written["accepted"]] == ["gravity_scale"]
+    assert written["answer"] == "unexplained residual, although an effect was added: gravity scale"
+    assert text(written).endswith(written["answer"])
 
 
-@pytest.mark.parametrize(("left", "fitted"), [(1.1, ["0", "1"]), (1.3, ["0", "1", "2", "3"])])
-def test_more_causes_are_fitted_while_much_is_left(left, fitted, monkeypatch):
-    """A cause that acts at a place may be far down in a linear ranking: of five that explain something, in twos."""
-    heard = []
-    explained = {"0": 0.5, "1": 0.4, "2": 0.3, "3": 0.2, "4": 0.15, "5": 0.05}
-    candidates = [SimpleNamespace(effect=name, explained=share) for name, share in explained.items()]
-
-    def trials(simulation, curriculum, start, candidates, *_):
-        heard.extend(c.effect for c in candidates)
-        return [Trial(c, fit()) for c in candidates]
-
-    monkeypatch.setattr(loop, "ranked", lambda *_, **__: candidates)
-    monkeypatch.setattr(loop, "_trials", trials)
-    monkeypatch.setattr(loop, "reduced_chi", lambda *_: left)
-    monkeypatch.setattr(loop, "_refit_simpler_candidates", lambda *_: None)
-    monkeypatch.setattr(loop, "confusable", lambda *_: {})
-    monkeypatch.setattr(loop, "_reasons", lambda *_: ["none is meant"])
-    simulation = Library()
-    simulation.curriculum = lambda base: []
-    base = fit(cost=2.0)
-    done = loop._round(simulation, base, [base], 1.0, RefineConfig(shortlist=2), lambda *_: None, Workers())
-    assert heard == fitted
-    assert done.accepted is None
+def test_arguments_stay_as_they_are():
+    model = LinearModel({**DRAG, **GRAVITY})
+    base, config = baseline(model), settings()
+    observations, values = model.observations, dict(base.values)
+    std = observations[0].residual_std.copy()
+    changing = Grids({**DRAG})
+    own = changing.observations[0]
+    refine(model, [base], config)
+    result = refine(changing, [baseline(changing)], settings())
+    assert model.observations is observations
+    np.testing.assert_array_equal(observations[0].residual_std, std)
+    assert base.values == values
+    assert (changing.observations[0], own.grid_changes) == (own, ())
+    assert len(result.observations[0].grid_changes) == 2  # its own are known to the result
 
 
-def test_a_cause_that_falls_short_of_its_promise_gets_fresh_derivatives(monkeypatch):
-    base = SimpleNamespace(
-        model=SimpleNamespace(with_effect=lambda name: name), values={}, cost=1.0, parameters=(), effects=()
-    )  # fmt: skip
-    candidate = SimpleNamespace(finite=False, effect="linear_drag", explained=0.8, rivals=(),
-                                theta={"linear_drag.0": 0.3})  # fmt: skip
-    ended = {"linear_drag.0": 1e-3}
-    calls = []
-    monkeypatch.setattr(add_effect, "held_in", lambda *_: frozenset())
-    monkeypatch.setattr(add_effect, "_fitted_beside", lambda simulation, base, term: list(term.parameters))
-    monkeypatch.setattr(add_effect, "_as_guessed", lambda *_: (0.95, ended, None, None))
-    monkeypatch.setattr(add_effect, "best_strength", lambda *_: (None, 1.2))
-    monkeypatch.setattr(
-        add_effect, "gauss_newton_fit", lambda simulation, model, values, **_: calls.append(values) or "fresh"
-    )
-    monkeypatch.setattr(add_effect, "evaluate_fit", lambda *_, **__: "as it was")
-    assert add_effect.refit(Library(), base, candidate, 1.0) == "fresh"
-    assert calls == [ended]
-    candidate.explained = 0.05
-    assert add_effect.refit(Library(), base, candidate, 1.0) == "as it was"
+class Grids(LinearModel):
+    """Finer grids change the motion along y; ``factor`` times as much once an effect is in the model."""
+
+    factor = 1.0
+
+    def finer_grids(self, model, values, index):
+        size = self.factor if model.effects else 1.0
+        one = size * 2e-3 * pattern(1, TIMES**3, ONES)
+        return [one, 1.5 * one + size * 1e-3 * pattern(0, np.sin(20 * TIMES), POINTS[:, 1])]
+
+
+def test_after_a_rejection_residuals_are_whitened_as_before():
+    """What was accepted explains less than half, so it is taken back, and what grids change along its motion, too."""
+    unknown = 0.05 * np.random.default_rng(1).normal(size=EFFECTS["linear_drag"].shape)
+    model = Grids({"linear_drag.strength": 0.2})
+    model.factor = 3.0
+    (observation,) = model.observations
+    model = model.with_observations([replace(observation, values=observation.values + unknown)])
+    start, _ = whitened_start(model, [baseline(model)], settings())
+    result = refined(model, {"min_gain": 0.0, "decisive_gain": 0.0, "max_effects": 1})
+    rejected = [
+        t.effect for t in result.search.rounds[0].trials for why in t.objections if "it leaves a residual" in why
+    ]
+    assert rejected == ["linear_drag"]
+    assert result.accepted == ()
+    assert result.verdict == "unexplained residual"
+    np.testing.assert_array_equal(result.observations[0].residual_std, start.forward_model.observations[0].residual_std)
+    assert result.reduced_chi(result.before) == pytest.approx(start.reduced_chi)
+
+
+@pytest.mark.parametrize("named", [[], ["linear_drag", "body_force", "gravity_scale"]])
+def test_effects_that_exclude_each_other_are_never_in_one_model(named):
+    """Two contact effects, for instance: in the second round the configuration names one that cannot be added."""
+    strengths = {"body_force.strength": 0.5, "gravity_scale.strength": 0.05}
+    model = LinearModel(strengths, exclusive=("linear_drag", "body_force"))
+    result = refined(model, {"effects": named, "search_second_effect": False})
+    assert [t.name for t in result.accepted] == ["body_force", "gravity_scale"]
+    first, second = result.search.rounds
+    assert first.ranking.not_ranked == {}
+    assert second.ranking.not_ranked == ({"linear_drag": "it cannot act here in addition"} if named else {})
+
+
+def test_what_diverges_is_listed_with_its_reason():
+    result = refined(LinearModel({**DRAG}, diverges=("viscosity",)))
+    written = document(result)
+    assert [(r["effect"], "flew apart" in r["reason"]) for r in written["not_ranked"]] == [("viscosity", True)]
+    assert "viscosity" not in {c["effect"] for c in written["candidates"]}
+    assert "not ranked: it flew apart" in text(written)
+
+
+class Brittle(LinearModel):
+    """An effect that can be simulated at the strengths of the ranking alone: its refit has no derivatives."""
+
+    def fields(self, model, values, *, held_out=False):
+        strength = values.get("body_force.strength", 0.0)
+        if strength not in (0.0, 0.01):
+            from masiv.errors import NonFiniteError
+
+            raise NonFiniteError(5, 6, "it broke")
+        return super().fields(model, values, held_out=held_out)
+
+
+def test_a_refit_that_cannot_be_simulated_is_listed_with_its_reason():
+    result = refined(Brittle({"body_force.strength": 0.3}), {"effects": ["body_force"]})
+    (done,) = document(result)["rounds"]
+    assert done["refits"] == []
+    assert [(f["effect"], f["law"]) for f in done["not_fitted"]] == [("body_force", "rigid")]
+    assert "diverges" in done["not_fitted"][0]["reason"] or "it broke" in done["not_fitted"][0]["reason"]
+
+
+def test_ranking_alone_fits_and_changes_nothing():
+    model = LinearModel({**DRAG, **GRAVITY})
+    result = refined(model, rank_only=True)
+    assert (result.verdict, result.accepted, result.changes_twin) == ("ranked only", (), False)
+    (done,) = result.search.rounds
+    assert done.trials == ()
+    assert done.candidates[0].effect == "gravity_scale"
+    assert len(done.candidates) == len(EFFECTS)
+
+
+def test_effects_that_are_known_are_not_called_added():
+    model = LinearModel({**DRAG, **GRAVITY})
+    result = refined(model, known=["linear_drag"])
+    assert result.before.model.effects == ("linear_drag",)
+    assert [t.name for t in result.accepted] == ["gravity_scale"]
+
+
+def test_a_force_stands_in_for_what_no_effect_explains():
+    unknown = pattern(1, np.sin(9 * TIMES), 1 + POINTS[:, 0])
+    library = {**EFFECTS, DISCREPANCY_FORCE: unknown}
+    model = LinearModel({f"{DISCREPANCY_FORCE}.strength": 0.4}, effects=library)
+    model.candidates = lambda model: [n for n in EFFECTS if n not in model.effects]
+    result = refine(model, [baseline(model)], replace(settings({"effects": ["viscosity"]}), discrepancy_force=True))
+    assert result.accepted == ()
+    assert result.verdict == "unexplained residual"
+    assert result.changes_twin
+    assert result.twin_fit.model.effects == (DISCREPANCY_FORCE,)
+    assert document(result)["discrepancy_force"]["theta"] == {"strength": pytest.approx(0.4, rel=0.01)}
+
+
+def test_names_are_checked_before_anything_is_simulated():
+    model = LinearModel({})
+    base = baseline(model)
+    rollouts = model.rollouts
+    with pytest.raises(InputError, match="unknown effect 'ether'"):
+        refine(model, [base], settings({"effects": ["ether"]}))
+    twice = model.with_observations([*model.observations, *model.observations])
+    with pytest.raises(ValueError, match="names that differ: a, a"):
+        refine(twice, [base], settings())
+    assert model.rollouts == rollouts
+
+
+def test_the_law_that_predicts_the_motion_is_the_base():
+    """A law that takes an effect over in the fitted instants is exposed by the held-out ones."""
+    late = pattern(1, np.where(TIMES > 0.76, 40.0, 1.0) * TIMES**2, ONES)
+    model = LinearModel({"velocity_z": 0.3, "viscosity.strength": 2e-3}, effects={**EFFECTS, "swirl": late})
+
+    def law(kind, values):
+        family = Family(kind, (), {})
+        fitted = gauss_newton_fit(model, Model(family, "none"), {}, budget=12)
+        fields = [f + model.motion(values) for f in fitted.fields]
+        residual = np.concatenate([f[:30].ravel() for f in fields])
+        return replace(fitted, fields=fields, residual=residual, cost=float((residual**2).mean()))
+
+    from masiv.inference.noise_model import NoiseModel
+    from masiv.refine.evidence import select_by_validation
+
+    nearest, predicts = law("plastic", {"swirl.strength": 2e-3}), law("viscous", {"gravity_scale.strength": 3e-3})
+    assert nearest.cost < predicts.cost
+    assert select_by_validation([nearest, predicts], NoiseModel(model.observations)) is predicts
+
+
+def test_a_worse_law_is_not_fitted_with_what_would_not_make_up_for_it():
+    model = LinearModel({**DRAG, **GRAVITY})
+    base = baseline(model)
+    ranking = score(model, base, list(EFFECTS), robust_scale=1.0)
+    best, worst = ranking.candidates[0], ranking.candidates[-1]
+    trials = [Trial(best, fit_with_effect(model, base, best, 1.0))]
+    assert could_improve(worst, base, [])
+    assert could_improve(best, base, trials)
+    assert not could_improve(worst, base, trials)
+
+
+def test_a_baseline_that_cannot_be_simulated_does_not_end_the_search():
+    model = LinearModel({**DRAG})
+    good = baseline(model)
+
+    class Fragile(LinearModel):
+        def fields(self, model, values, *, held_out=False):
+            if model.family.kind == "fragile":
+                raise MasivError("it cannot be simulated here")
+            return super().fields(model, values, held_out=held_out)
+
+    fragile = Fragile({**DRAG})
+    bad = replace(good, model=replace(good.model, family=Family("fragile", (), {})), cost=2 * good.cost)
+    result = refine(fragile, [good, bad], settings())
+    assert [t.name for t in result.accepted] == ["linear_drag"]
+    with pytest.raises(MasivError, match="cannot be simulated here"):
+        refine(fragile, [bad, bad], settings())

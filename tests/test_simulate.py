@@ -192,7 +192,7 @@ def test_classical_laws_of_one_kind_blend_their_parameters():
 def test_a_mesh_keeps_mass_size_and_place(tmp_path):
     path = tmp_path / "ball.obj"
     trimesh.creation.icosphere(subdivisions=3, radius=40.0).export(path)  # in millimetres, say
-    body = twin(up=(0.0, 0.0, 1.0))
+    body = twin(up=(0.0, 0.0, 1.0), simulator=SMALL.model_copy(update={"subparticles": 4}))
     ball = with_density(with_mesh(body, path), 700.0)
     true = np.pi / 6 * np.ptp(body.positions, axis=0).max() ** 3  # a ball as wide as the cube's outer points
     assert ball.volume == pytest.approx(true, rel=0.03)

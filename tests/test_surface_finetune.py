@@ -18,8 +18,8 @@ from masiv.identify.neural.training import TrainingResult
 from masiv.identify.recording import FitRecording
 from masiv.identify.stage import identify
 from masiv.materials.load import load_law
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.pretraining.pretrain import pretrained_path
 from masiv.scene.scene import Frame
 from masiv.splat.rasteriser import render
@@ -50,7 +50,8 @@ def filmed(seen):  # noqa: F811
 
 def objective_of(filmed, seen, **changes):  # noqa: F811
     config = settings(**{"pictures": 4, "iterations": 16, **changes})
-    return Objective(Problem(filmed, seen[0], config, SMALL))
+    problem = FilmedBody(filmed, seen[0], SMALL, samples=config.samples_per_frame)
+    return Objective(problem, config)
 
 
 def trained(objective, error):

@@ -17,8 +17,8 @@ from masiv.effects.catalogue import effects
 from masiv.errors import MasivError
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.attachment import attach
-from masiv.models.marker_body import plan, simulated_body, simulated_markers
-from masiv.mpm.rollout import at_rest, rollout
+from masiv.models.marked_body import marked_body
+from masiv.mpm.rollout import at_rest
 from masiv.tracks.declaration import GeometryDeclaration
 from masiv.tracks.geometry import fill_geometry, make_geometry
 from masiv.tracks.read import read_tracks
@@ -102,9 +102,9 @@ def _second_moments(solid):
 
 def test_mass_and_place_in_the_simulator():
     scene = bar()
-    body = simulated_body(scene, scene.runs[0], CONFIG, particle_spacing=5e-3)
-    made = plan(body, ClassicalLaw("neo_hookean", youngs_modulus=1e5, poissons_ratio=0.3), np.array([0, 0.01]), CONFIG)
-    assert made.simulator.mass.double().sum().item() == pytest.approx(1070 * 9e-5, rel=1e-6)
+    body = marked_body(scene, scene.runs[0], CONFIG, particle_spacing=5e-3)
+    assert body.mass == pytest.approx(1070 * 9e-5, rel=1e-6)
+    assert body.context(1.0, 0.01).particle_mass * len(body.particles) == pytest.approx(body.mass, rel=1e-12)
     assert body.gravity == pytest.approx(np.array([0, -9.8, 0]))  # up is an axis of the grid
     normal, height = body.normals[0].numpy(), body.heights[0].item()
     along = np.abs(normal).argmax()
@@ -120,16 +120,18 @@ def test_mass_and_place_in_the_simulator():
 def test_clamp_holds_against_effects_and_has_no_part_in_gradients(taichi):
     """Within the clamp nothing moves at all, whatever acts there; the gradient of a drag beside it is right."""
     scene = bar()
-    body = simulated_body(scene, scene.runs[0], CONFIG, particle_spacing=7.5e-3)
+    body = marked_body(scene, scene.runs[0], CONFIG, particle_spacing=7.5e-3)
     body = replace(body, heights=body.heights + 0.045)
     law = ClassicalLaw("neo_hookean", youngs_modulus=5e4, poissons_ratio=0.3)
-    made = plan(body, law, np.array([0, 0.02]), CONFIG, dtype=F64)
+    substep = body.substep(law, np.array([0, 0.02]))
+    steps = round(0.02 / substep)
     depth = body.particles @ body.normals[0] - body.heights[0]
 
     def moved(rate):
-        active = body.effects(((effects()["linear_drag"], rate),), duration=0.02, frame_time=0.02)
+        active = body.effects(((effects()["linear_drag"], rate),), body.context(0.02, 0.02))
         state = at_rest(body.particles, 0.3 * torch.ones_like(body.particles), torch.zeros(len(depth), 3, 3, dtype=F64))
-        return rollout(made.simulator, law, state, made.steps, [made.steps], active)[0] - body.particles
+        moved = body.rollout(law, state, [steps], substep=substep, contact="none", effects=active)
+        return moved[0] - body.particles
 
     rate = torch.tensor([2.0], dtype=F64, requires_grad=True)
     path = moved(rate)
@@ -152,8 +154,8 @@ def test_cantilever_swings_with_its_frequency_and_is_read_back(taichi, tmp_path)
     times, scene = np.arange(0, 0.25, 5e-3), bar()
     errors = []
     for cells in (3, 4):
-        body = simulated_body(scene, scene.runs[0], CONFIG, particle_spacing=0.015 / cells)
-        tip = simulated_markers(body, law, times, CONFIG)
+        body = marked_body(scene, scene.runs[0], CONFIG, particle_spacing=0.015 / cells)
+        tip = body.markers_to_world(body.run(law, times)[1])
         hz, decay, amplitude = swing(times, tip[:, 0, 0], theory)
         errors.append(abs(hz / theory - 1))
         assert 0 < decay < 1
@@ -172,9 +174,9 @@ def test_cantilever_swings_with_its_frequency_and_is_read_back(taichi, tmp_path)
     }))  # fmt: skip
     read = read_tracks(tmp_path)
     np.testing.assert_allclose(read.runs[0].positions, tip, atol=1e-9)
-    again = simulated_body(read, read.runs[0], CONFIG, particle_spacing=0.015 / 4)
+    again = marked_body(read, read.runs[0], CONFIG, particle_spacing=0.015 / 4)
     torch.testing.assert_close(again.particles, body.particles)
-    np.testing.assert_allclose(simulated_markers(again, law, times, CONFIG), tip, atol=2e-6)
+    np.testing.assert_allclose(again.markers_to_world(again.run(law, times)[1]), tip, atol=2e-6)
 
 
 def _sag(youngs, thickness=0.03, length=0.1):

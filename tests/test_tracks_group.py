@@ -12,8 +12,9 @@ import pytest
 import yaml
 
 from masiv.errors import InputError
-from masiv.models.free_body import Model
-from masiv.models.point_mass import RIGID, PointSimulation, point_runs
+from masiv.models.base import Model
+from masiv.models.point_mass import RIGID, PointMassModel
+from masiv.observations.tracks import flight_observations
 from masiv.refine.config import RefineConfig
 from masiv.refine.from_tracks import refine_group
 from masiv.refine.search_state import SearchSettings
@@ -73,7 +74,7 @@ def found(tracks):
 def test_flight_is_that_of_the_closed_form(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "light": Ball(0.03, 0.08, 0.5)}
     tracks = write_scene(tmp_path, balls, noise=0.0)
-    simulation = PointSimulation(tracks, point_runs(tracks, "balls"))
+    simulation = PointMassModel(tracks, flight_observations(tracks, "balls"))
     for run in simulation.observations:
         ball = balls[run.body]
         model = Model(RIGID, "none", ("quadratic_drag",) if ball.drag else ())
@@ -129,7 +130,7 @@ def test_what_cannot_be_a_group(tmp_path):
     with pytest.raises(InputError, match="hold_out"):
         found(tracks)
     with pytest.raises(InputError, match="no group 'ball': it has balls"):
-        point_runs(tracks, "ball")
+        flight_observations(tracks, "ball")
     assert mean_diameter(tracks.bodies["one"].geometry) == pytest.approx(0.1)
 
 

@@ -17,12 +17,13 @@ from test_tracks_group import Ball, write_scene
 from masiv.cli import main
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
-from masiv.identify.tracks import family_of, fit_law, simulation_of
+from masiv.identify.tracks import fit_law, simulation_of
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.clamped_body import BodySimulation
-from masiv.models.free_body import Model
-from masiv.models.marker_body import simulated_body, simulated_markers
+from masiv.models.base import Model
+from masiv.models.clamped_body import ClampedBodyModel
+from masiv.models.families import family_of
+from masiv.models.marked_body import marked_body
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.refine.candidates import score
 from masiv.refine.config import RefineConfig
@@ -64,13 +65,14 @@ def write_bar(folder: Path, runs) -> Path:
     tracks = read_tracks(folder)
     for seed, (name, condition, _) in enumerate(runs):
         run = next(r for r in tracks.runs if r.name == name)
-        body = simulated_body(tracks, run, SIMULATOR, particle_spacing=(9e-5 / PARTICLES) ** (1 / 3))
+        body = marked_body(tracks, run, SIMULATOR, particle_spacing=(9e-5 / PARTICLES) ** (1 / 3))
         members = [(effect_named("viscosity"), torch.tensor([VISCOSITY]))]
         if condition == "load":
             tip = body.particles[:, 2].max().item()
             members.append((effect_named("point_mass"), torch.tensor([LOAD, 0.0, 0.0, tip])))
         law = ClassicalLaw("neo_hookean", youngs_modulus=YOUNGS, poissons_ratio=RATIO)
-        moved = simulated_markers(body, law, times, SIMULATOR, tuple(members), speed=1.0)
+        acting = body.effects(members, body.context(float(times[-1]), float(times[-1]) / (len(times) - 1)))
+        moved = body.markers_to_world(body.run(law, times, acting)[1])
         free = np.tile(places, (len(times), 1, 1))
         free[:, :3] = moved
         save(folder / f"{name}.csv", at, np.concatenate([still, free]), seed)
@@ -132,7 +134,7 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     simulation = only(simulation_of(bar, "load", TRACKS, SIMULATOR, known=known), ("point_mass", "gravity_scale"))
     family = family_of("neo_hookean", 1070, known)
     base = gauss_newton_fit(simulation, Model(family, "none", ("viscosity",)), {}, budget=4)
-    assert simulation.curriculum(base)  # its phase is lost
+    assert simulation.curriculum(base.fields)  # its phase is lost
     result = refine(simulation, [base], settings(shortlist=1))
     after = result.after
     assert after.model.effects == ("viscosity", "point_mass")
@@ -145,7 +147,7 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
 def test_a_static_deflection_strains_as_it_moves(bar):
     """F is the gradient of the displacement, and a section turns without shear."""
     run = next(r for r in bar.runs if r.name == "own_a")
-    body = simulated_body(bar, run, SIMULATOR, particle_spacing=5e-3)
+    body = marked_body(bar, run, SIMULATOR, particle_spacing=5e-3)
     axes = clamp_axes(body.gravity, body.normals)
     x, gradient = static_deflection(body.particles, body.heights[0], axes, 2e-3)
     before = body.particles
@@ -178,12 +180,14 @@ def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
         "tip_deflection": -4e-3,
     }  # fmt: skip
     named = {f"{name}@{run.name}": value for name, value in truth.items()}
-    assert {p.name for p in run.starts} == set(named)
-    seen = simulation.markers(replace(run, fitted=True), model, named)
-    plain = simulation.markers(replace(run, fitted=True), model, dict.fromkeys(named, 0.0))
+    parameters = simulation.release_parameters(run)
+    assert {p.name for p in parameters} == set(named)
+    fitted = replace(run, fit_count=run.time_count)
+    seen = simulation.markers(fitted, model, named)
+    plain = simulation.markers(fitted, model, dict.fromkeys(named, 0.0))
     assert np.abs(seen - plain).max() > 2e-3
-    found, markers = simulation.fit_release(replace(run, observed=seen), model, {})
-    for p, value in zip(run.starts, found, strict=True):
+    found, markers = simulation.fit_release(replace(run, values=seen), model, {})
+    for p, value in zip(parameters, found, strict=True):
         assert value == pytest.approx(named[p.name], abs=0.2 * p.step), p.name
     np.testing.assert_allclose(markers, seen, atol=1e-5)
     # That of a fitted run is found, too, and not among what is fitted.
@@ -200,12 +204,12 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
     term = simulation.term("point_mass")
     places = tuple(sorted(term.guesses, key=lambda place: place[2]))  # along the bar, from the clamp
     coarse = replace(term, guesses=(places[0], places[-1]))
-    simulation.term = lambda name: coarse if name == "point_mass" else BodySimulation.term(simulation, name)
+    simulation.term = lambda name: coarse if name == "point_mass" else ClampedBodyModel.term(simulation, name)
     base = gauss_newton_fit(
         simulation, Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",)), {}, budget=4
     )
-    assert simulation.is_out_of_phase(base)
-    assert not simulation.curriculum(base)
+    assert simulation.is_out_of_phase(base.fields)
+    assert not simulation.curriculum(base.fields)
     (found,) = score(simulation, base, ["point_mass"], robust_scale=1e-3).candidates
     assert found.finite
     after = fit_with_effect(simulation, base, found, 1e-3)
@@ -216,7 +220,7 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
 
 def test_what_acts_on_the_matter_at_a_place_is_in_the_body(bar):
     simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known={})
-    particles = simulation.observations[0].body.particles.numpy()
+    particles = simulation.body(simulation.observations[0]).particles.numpy()
     for name in ("point_mass", "point_force"):
         for p, low, high in zip(simulation.term(name).others, particles.min(0), particles.max(0), strict=True):
             assert (p.lower, p.upper) == pytest.approx((low, high))

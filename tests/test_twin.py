@@ -157,6 +157,7 @@ def test_a_filmed_body_of_schema_1(tmp_path):
         [("rate", 3.0, "1/s", 0.1)], [("delay", 0.011, "s", None)]
     ]  # fmt: skip
     assert twin.fit["history"] == [1.0, None]
+    assert twin.simulator.subparticles == 4
     twin.save(tmp_path)
     assert yaml.safe_load((tmp_path / "twin.yaml").read_text())["schema"] == 2
     assert_same(Twin.load(tmp_path), twin)

@@ -19,15 +19,14 @@ from masiv.cli import main
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
-from masiv.identify.config import IdentifyConfig
 from masiv.materials.classical import ClassicalLaw
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, rigid_initial_state
-from masiv.models.problem import Problem
 from masiv.mpm.design import grid_spacing, substeps_per_frame
 from masiv.mpm.simulator import Simulator
 from masiv.pipeline import Overrides, open_run
 from masiv.report.page import Page
-from masiv.report.report import _effects_section
+from masiv.report.sections.twin import effects_table
 from masiv.runfolder import STAGES
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.force import ForcePulse
@@ -225,13 +224,13 @@ def fitted(body, frames, steps):
         path=Path("simulated"), layout="none", fps=FPS, frame_count=frames, cameras=(), gravity=body.gravity,
         up=body.up, ground=body.ground, density=body.density, load=no_picture, mask_source="none",
     )  # fmt: skip
-    problem = Problem(scene, Still(body, frames), IdentifyConfig(samples_per_frame=2), CONFIG)
+    problem = FilmedBody(scene, Still(body, frames), CONFIG, samples=2)
     members = [(effect_named(e.name), torch.tensor(list(e.values.values()))) for e in body.effects]
     throw = InitialState(*(torch.tensor(v, dtype=torch.float32) for v in (body.velocity, body.omega, 0.0)))
-    effects = ActiveEffects(tuple(members), problem.setting()) if members else None
+    effects = ActiveEffects(tuple(members), problem.context()) if members else None
     with torch.no_grad():
         moved = problem.run(body.law, throw, body.contact, frames - 1, steps, effects)
-    return torch.cat([problem.start[None], moved[1::2]]).numpy()
+    return torch.cat([problem.particles[None], moved[1::2]]).numpy()
 
 
 @pytest.mark.parametrize(
@@ -307,9 +306,9 @@ def test_the_command_leaves_effects_out(tmp_path, monkeypatch, capfd):
 
 def test_the_report_lists_effects(tmp_path):
     page = Page("twin")
-    _effects_section(page, twin())
+    effects_table(page, twin())
     assert page.parts == []
-    _effects_section(page, twin(DRAG, LATE))
+    effects_table(page, twin(DRAG, LATE))
     text = "".join(page.parts)
     for part in ("linear drag", "rate", "3", "1/s", "0.1", "delay", "0.011", "–"):
         assert f">{part}<" in text

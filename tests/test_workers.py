@@ -21,14 +21,16 @@ from masiv.identify.classical.fit import FamilyFit
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.losses.objective import Objective
 from masiv.identify.neural.starting_law import choose_starting_laws, search_cost
+from masiv.models.base import Model
 from masiv.models.families import FAMILIES
-from masiv.models.free_body import Model, Simulation, parameters
+from masiv.models.filmed_body import FilmedBody
+from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import InitialState
-from masiv.models.prepare import video_observation
-from masiv.models.problem import Problem
+from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import SampledMotion
 from masiv.refine.baselines import ALL_FRAMES_STAGE, baselines, differentiated
 from masiv.refine.config import RefineConfig
+from masiv.refine.prepare import prepare
 from masiv.refine.tasks import map_tasks, rank
 from masiv.workers import TaskError, Workers, process_count, unwrap
 
@@ -219,10 +221,11 @@ def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch
     motion = observed({})
     motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
-    problem = Problem(scene(), motion, config, SMALL, chosen=np.arange(0, 512, 4))
+    problem = FilmedBody(scene(), motion, SMALL, chosen=np.arange(0, 512, 4))
+    objective = Objective(problem, config)
     throw = InitialState.of_world(problem.axes, np.array(VELOCITY), np.array(OMEGA))
     listening = Listening()
-    alone, beside = (choose_starting_laws(Objective(problem), throw, quiet, workers) for workers in (listening, two))
+    alone, beside = (choose_starting_laws(objective, throw, quiet, workers) for workers in (listening, two))
     assert len(alone) == 2
     efforts = [search_cost(name, modulus) for _, _, name, _, _, modulus in listening.heard[1]]
     assert efforts == sorted(efforts, reverse=True)  # or the longest search may begin last, alone
@@ -237,8 +240,8 @@ def small_simulation():
     first = SampledMotion(motion.positions[:FITTED], motion.times[:FITTED], motion.volume)
     config = RefineConfig(particles=200, samples_per_frame=1, laws=["neo_hookean"])
     contact = IdentifyConfig(contact="sticky")
-    observation, *_ = video_observation("run", scene(), first, motion, contact, SMALL, config)
-    return Simulation([observation]), config
+    setup, *_ = prepare("run", scene(), first, motion, contact, SimulatorConfig(), config)
+    return FreeBodyModel([setup]), config
 
 
 def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
@@ -261,10 +264,10 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     monkeypatch.setattr("masiv.refine.tasks.EFFECTS_PER_TASK", 1)
     simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
-    values = {p.name: p.start for p in parameters(model, simulation.observations)}
+    values = {p.name: p.start for p in simulation.parameters(model)}
     values |= {f"velocity_{a}@run": v for a, v in zip("xyz", VELOCITY, strict=True)}
     values |= {f"omega_{a}@run": v for a, v in zip("xyz", OMEGA, strict=True)}
-    simulation.settle(model, values)
+    simulation.hold_substeps(model, values)
     names = ["linear_drag", "gravity_scale"]
     found = []
     for workers in (Workers(1), two):

@@ -116,7 +116,8 @@ def describe_twin(
 
     chosen = kd_tree_subset(twin.positions.astype(np.float64), particles)
     coarse = replace(
-        twin.with_body(particles=twin.positions[chosen]), simulator=twin.simulator.model_copy(update={"split": 1})
+        twin.with_body(particles=twin.positions[chosen]),
+        simulator=twin.simulator.model_copy(update={"subparticles": 1}),
     )
     done = 0
 

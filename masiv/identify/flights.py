@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from masiv.inference.model_fit import ModelFit, gauss_newton_fit
-from masiv.models.free_body import Model
-from masiv.models.point_mass import RIGID, PointSimulation
+from masiv.models.base import Model
+from masiv.models.point_mass import RIGID, PointMassModel
 
 
 def fit_flights(
-    forward_model: PointSimulation, model: Model | None = None, values: Mapping[str, float] | None = None
+    forward_model: PointMassModel, model: Model | None = None, values: Mapping[str, float] | None = None
 ) -> ModelFit:
     """Free fall, of which only the start of each flight is fitted; or ``model``, from ``values``."""
     model = model or Model(RIGID, "none")

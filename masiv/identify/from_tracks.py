@@ -8,10 +8,11 @@ from masiv import runtime
 from masiv.config import Config
 from masiv.errors import InputError, MasivError
 from masiv.identify.flights import fit_flights
-from masiv.identify.tracks import conditions, family_of, fit_law, only_body, ratio_of, simulation_of
+from masiv.identify.tracks import conditions, fit_law, only_body, ratio_of, simulation_of
 from masiv.inference.model_fit import ModelFit, rank_by_bic
-from masiv.models.families import FAMILIES
-from masiv.models.point_mass import PointSimulation, point_runs
+from masiv.models.families import FAMILIES, family_of
+from masiv.models.point_mass import PointMassModel
+from masiv.observations.tracks import flight_observations
 from masiv.progress import Progress, silent
 from masiv.simulation.fitted_twin import fitted_twin
 from masiv.tracks.tracks import Tracks
@@ -45,7 +46,7 @@ def identify_tracks(
     group = group_of(tracks)
     with runtime.torch_threads(1):
         if group is not None:
-            forward_model = PointSimulation(tracks, point_runs(tracks, group))
+            forward_model = PointMassModel(tracks, flight_observations(tracks, group))
             fitted = fit_flights(forward_model)
             return fitted_twin(described, fitted, forward_model, errors_mm(fitted)), [fitted]
         fits = _fit_laws(tracks, config, folder, progress)

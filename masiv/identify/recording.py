@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from masiv.continuum.trajectory import Trajectory
 from masiv.identify.config import IdentifyConfig
 from masiv.identify.losses.objective import Objective
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialMotion, InitialState, estimate_initial_motion
-from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Scene
 
@@ -32,10 +32,10 @@ def prepare_recording(
     scene: Scene, trajectory: Trajectory, config: IdentifyConfig, simulator: SimulatorConfig
 ) -> tuple[FitRecording, InitialMotion]:
     """A recording whose fit starts with the initial motion of its free flight, over those frames and one more."""
-    problem = Problem(scene, trajectory, config, simulator)
+    problem = FilmedBody(scene, trajectory, simulator, samples=config.samples_per_frame)
     motion = estimate_initial_motion(
         trajectory.positions, trajectory.times, scene.gravity, scene.ground, clearance=problem.spacing
     )
     initial_state = InitialState.of_world(problem.axes, motion.velocity, motion.omega)
     first_frames = min(motion.last_frame + 2, problem.frames)
-    return FitRecording(Objective.of(problem, trajectory), initial_state, first_frames), motion
+    return FitRecording(Objective.of(problem, trajectory, config), initial_state, first_frames), motion

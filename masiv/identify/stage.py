@@ -21,11 +21,12 @@ from masiv.identify.losses.objective import Objective
 from masiv.identify.neural.multi_start import fit_neural_law
 from masiv.identify.recording import FitRecording, prepare_recording
 from masiv.identify.result import IdentificationResult
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.mpm.config import SimulatorConfig
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
+from masiv.simulation.twin_effects import effect_members
 from masiv.subsample import random_subset
 from masiv.twin import Twin
 
@@ -100,12 +101,13 @@ def relearn(
 
     The fit starts with the initial state of ``twin``. Raises MasivError if no law explains the motion.
     """
-    problem = Problem(scene, trajectory, config, twin.simulator, known=twin.effects)
+    known = effect_members(twin, twin.body)
+    problem = FilmedBody(scene, trajectory, twin.simulator, samples=config.samples_per_frame, known=known)
     axes = problem.axes
     ground_offset = 0.0 if twin.ground is None or scene.ground is None else twin.ground.height - scene.ground.height
     initial_state = InitialState.of_world(axes, twin.velocity, twin.omega, ground_offset)
-    recording = FitRecording(Objective.of(problem, trajectory), initial_state, (problem.frames + 1) // 2)
-    coarse = _coarse(scene, trajectory, recording, seed, twin)
+    recording = FitRecording(Objective.of(problem, trajectory, config), initial_state, (problem.frames + 1) // 2)
+    coarse = _coarse(scene, trajectory, recording, seed)
     with runtime.torch_threads(1):
         result = fit_neural_law([recording], coarse, seed, checkpoint or Checkpoint(None), progress)
     fitted = result.initial_state
@@ -116,16 +118,16 @@ def relearn(
     return replace(learned, fit={**twin.fit, **result.report, **errors})
 
 
-def _coarse(
-    scene: Scene, trajectory: Trajectory, recording: FitRecording, seed: int, twin: Twin | None = None
-) -> Callable[[], Objective]:
-    """Makes the objective of ``recording`` with few particles, and the effects of ``twin``."""
-    config, simulator = recording.objective.config, recording.objective.problem.simulator
+def _coarse(scene: Scene, trajectory: Trajectory, recording: FitRecording, seed: int) -> Callable[[], Objective]:
+    """Makes the objective of ``recording`` with few particles, and the same known effects."""
+    config, whole = recording.objective.config, recording.objective.problem
 
     def make() -> Objective:
         chosen = random_subset(trajectory.positions.shape[1], config.search_particles, seed)
-        known = () if twin is None else twin.effects
-        return Objective.of(Problem(scene, trajectory, config, simulator, chosen=chosen, known=known), trajectory)
+        problem = FilmedBody(
+            scene, trajectory, whole.body.config, samples=config.samples_per_frame, chosen=chosen, known=whole.known
+        )
+        return Objective.of(problem, trajectory, config)
 
     return make
 

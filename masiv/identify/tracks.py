@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from masiv.errors import InputError, MasivError, NonFiniteError
-from masiv.inference.model_fit import ModelFit, gauss_newton_fit, rms_mm
-from masiv.models.clamped_body import BodySimulation, body_run, shortened
-from masiv.models.families import FAMILIES, Family
-from masiv.models.free_body import Model
+from masiv.inference.model_fit import ModelFit, gauss_newton_fit
+from masiv.models.base import Model
+from masiv.models.clamped_body import ClampedBodyModel, run_of_body
+from masiv.models.families import Family
 from masiv.models.parameters import Parameter
 from masiv.mpm.config import SimulatorConfig
+from masiv.observations.base import rms_mm
 from masiv.progress import Progress
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.tracks import Body, Run, Tracks
@@ -49,7 +49,7 @@ def runs_of(tracks: Tracks, condition: str) -> tuple[Run, ...]:
 def simulation_of(
     tracks: Tracks, condition: str, config: TracksConfig, simulator: SimulatorConfig, *, known: dict[str, float],
     folder: Path | None = None, whole: bool = False,
-) -> BodySimulation:  # fmt: skip
+) -> ClampedBodyModel:  # fmt: skip
     """The runs of ``condition`` over the configured time; ``whole``: with the first moments that they leave out."""
     body = only_body(tracks)
     if body.geometry is None:
@@ -57,12 +57,12 @@ def simulation_of(
 
     spacing = (body.geometry.volume / config.particles) ** (1 / 3)
     runs = [
-        body_run(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.ignore_after_release)
+        run_of_body(tracks, run, simulator, spacing, config.duration, 0.0 if whole else run.ignore_after_release)
         for run in runs_of(tracks, condition)
     ]
-    last = max(float(run.times[-1]) for run in runs)
+    last = max(float(observation.times[-1]) for observation, _ in runs)
     horizons = [h for k in range(16) if (h := config.search_duration * 2**k) < 0.9 * last]
-    return BodySimulation(tracks, runs, simulator, known=known, horizons=horizons, folder=folder)
+    return ClampedBodyModel(tracks, runs, known=known, horizons=horizons, folder=folder)
 
 
 def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:
@@ -72,19 +72,12 @@ def ratio_of(body: Body, config: TracksConfig) -> dict[str, float]:
     return {"poissons_ratio": min(body.poissons_ratio, config.max_poissons_ratio)}
 
 
-def family_of(kind: str, density: float, known: dict[str, float]) -> Family:
-    """The family without the parameters that are known."""
-    family = FAMILIES[kind].scaled(density)
-    return replace(family, parameters=tuple(p for p in family.parameters if p.name not in known))
-
-
-def fit_law(simulation: BodySimulation, family: Family, config: TracksConfig, progress: Progress) -> ModelFit:
+def fit_law(simulation: ClampedBodyModel, family: Family, config: TracksConfig, progress: Progress) -> ModelFit:
     """``family`` fitted to the fitted runs: its scale by a search over the first moments, then all its parameters
     over ever more of the motion. Where the first moments are to be left out, that is done with them first: they have
     the phase from which the rest is counted. Raises MasivError where every law diverges."""
-    contact = "sticky" if simulation.ground else "none"
-    model = Model(family, contact)
-    if any(run.skip for run in simulation.observations):
+    model = Model(family, simulation.contact)
+    if any(run.skipped for run in simulation.observations):
         whole = simulation_of(
             simulation.tracks, simulation.observations[0].condition, config, simulation.config,
             known=simulation.known, folder=simulation.folder, whole=True,
@@ -106,19 +99,19 @@ def fit_law(simulation: BodySimulation, family: Family, config: TracksConfig, pr
             return fitted
 
 
-def _cut(simulation: BodySimulation, duration: float) -> BodySimulation:
-    runs = [shortened(run, duration) for run in simulation.observations if run.fitted]
+def _cut(simulation: ClampedBodyModel, duration: float) -> ClampedBodyModel:
+    runs = [run.shortened(duration) for run in simulation.observations if run.fitted]
     return simulation.over(runs)
 
 
-def _searched(simulation: BodySimulation, model: Model, progress: Progress) -> dict[str, float]:
+def _searched(simulation: ClampedBodyModel, model: Model, progress: Progress) -> dict[str, float]:
     """Start values, the modulus by which the family searches first the best of a few."""
     start = {p.name: p.start for p in simulation.parameters(model)}
     scale: Parameter = next(p for p in model.family.parameters if p.log)
     found = []
     label = f"identify: {model.family.kind} search"
     for k, value in enumerate(np.geomspace(3 * scale.lower, scale.upper / 3, STIFFNESSES)):
-        simulation.substeps.clear()
+        simulation.held.clear()
         try:
             error = rms_mm(simulation.fields(model, {**start, scale.name: float(value)}))
             found.append((error, float(value)))

@@ -9,11 +9,13 @@ import numpy as np
 
 from masiv.config import Config
 from masiv.identify.from_tracks import group_of
-from masiv.identify.tracks import family_of, only_body, simulation_of
-from masiv.inference.model_fit import rms_mm
-from masiv.models.clamped_body import BodyRun, BodySimulation
-from masiv.models.free_body import Model
-from masiv.models.point_mass import RIGID, PointRun, PointSimulation, point_runs
+from masiv.identify.tracks import only_body, simulation_of
+from masiv.models.base import Model
+from masiv.models.clamped_body import ClampedBodyModel
+from masiv.models.families import family_of
+from masiv.models.point_mass import RIGID, PointMassModel
+from masiv.observations.base import rms_mm
+from masiv.observations.tracks import TracksObservation, flight_observations
 from masiv.simulation.fitted_twin import effect_values, law_values, start_values
 from masiv.tracks.tracks import Tracks
 from masiv.twin import Twin
@@ -23,7 +25,7 @@ from masiv.twin import Twin
 class TwinSimulation:
     """A twin's forward model of runs: their model with its values."""
 
-    simulation: BodySimulation | PointSimulation
+    simulation: ClampedBodyModel | PointMassModel
     model: Model
     values: dict[str, float]
 
@@ -36,7 +38,7 @@ def simulated(tracks: Tracks, twin: Twin, config: Config, condition: str | None 
     """``twin`` over the runs of ``condition`` (None: the first)."""
     group = group_of(tracks)
     if group is not None:
-        points = PointSimulation(tracks, point_runs(tracks, group))
+        points = PointMassModel(tracks, flight_observations(tracks, group))
         terms = [(e, points.made(e.name, e.bodies).name) for e in twin.effects]
         values = {n: v for e, term in terms for n, v in effect_values(e, term).items()}
         return TwinSimulation(
@@ -47,14 +49,14 @@ def simulated(tracks: Tracks, twin: Twin, config: Config, condition: str | None 
     simulation = simulation_of(tracks, twin.conditions[0], config.tracks, config.simulator, known=law)
     model = Model(
         family_of(twin.law.kind, only_body(tracks).density or 1e3, law),
-        "sticky" if simulation.ground else "none",
+        simulation.contact,
         tuple(e.name for e in twin.effects),
     )
     values = {n: v for e in twin.effects for n, v in effect_values(e, e.name).items()}
     return TwinSimulation(simulation, model, {**start_values(twin), **values})
 
 
-def run_errors(runs: Sequence[BodyRun | PointRun], fields: Sequence[np.ndarray]) -> list[dict]:
+def run_errors(runs: Sequence[TracksObservation | TracksObservation], fields: Sequence[np.ndarray]) -> list[dict]:
     """Root mean square distance of each run [mm]."""
     return [
         {"run": run.name, "use": "fit" if run.fitted else "hold_out", "rmse_mm": rms_mm([f]), "instants": len(f)}

@@ -15,8 +15,9 @@ import numpy as np
 
 from masiv.inference.model_fit import ModelFit
 from masiv.inference.robust import soft_l1_weight
-from masiv.models.base import ForwardModel, Observation
-from masiv.models.free_body import GRID_CHANGE
+from masiv.models.base import ForwardModel
+from masiv.models.free_body import GRID_CORRECTION
+from masiv.observations.base import Observation
 
 
 def with_residual_std(
@@ -43,7 +44,7 @@ def with_residual_std(
         whole = np.sqrt(np.mean([_size(change) ** 2 for change in changes[k]], axis=0))
         grid = np.minimum(more * np.sqrt(np.mean([each[k] ** 2 for each in kept], axis=0)), whole)
         std = np.hypot(seen, np.maximum.accumulate(grid))
-        out.append(replace(e, residual_std=std, grid_changes=tuple(changes[k])))
+        out.append(replace(e, residual_std=std, grid_corrections=tuple(changes[k])))
     return forward_model.with_observations(out)
 
 
@@ -53,11 +54,9 @@ def with_grid_errors(observations: Sequence[Observation], fitted: ModelFit, robu
 
     robust_scale [m]: whitened residuals above it are outliers.
     """
-    if not all(e.grid_changes for e in observations) or not fitted.parameters:
+    if not all(e.grid_corrections for e in observations) or not fitted.parameters:
         return fitted
-    beyond = [
-        [e.whiten((c - np.mean(e.grid_changes, axis=0))[: e.fit_count]) for c in e.grid_changes] for e in observations
-    ]
+    beyond = [[e.whiten((c - e.grid_correction)[: e.fit_count]) for c in e.grid_corrections] for e in observations]
     weight = soft_l1_weight(fitted.residual, robust_scale)
     columns = fitted.jacobian * weight[:, None]
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -116,7 +115,7 @@ def _not_absorbed(
         np.broadcast_to((e.residual_std / e.noise_std)[:, None, None], c.shape)
         for c, e in zip(changes, observations, strict=True)
     ]
-    own = [k for k, p in enumerate(fitted.parameters) if not p.name.startswith(GRID_CHANGE)]
+    own = [k for k, p in enumerate(fitted.parameters) if not p.name.startswith(GRID_CORRECTION)]
     columns = np.concatenate([shares, fitted.jacobian[:, own] * np.concatenate(flat(again))[:, None]], axis=1)
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     change = np.concatenate(parts)

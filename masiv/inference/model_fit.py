@@ -24,9 +24,9 @@ from masiv.inference.least_squares import (
 )
 from masiv.inference.noise_model import NoiseModel
 from masiv.inference.robust import robust_scale_of, soft_l1_mean_square, soft_l1_weight
-from masiv.models.base import ForwardModel, Observation
-from masiv.models.free_body import Model
+from masiv.models.base import ForwardModel, Model
 from masiv.models.parameters import Parameter
+from masiv.observations.base import Observation, rms_mm
 
 STRENGTH_FACTORS = (0.25, 1.0, 4.0)
 """Factors of a strength that the linear model promised, which are tried if it misled."""
@@ -79,12 +79,6 @@ def rank_by_bic(fits: Sequence[ModelFit]) -> list[ModelFit]:
         return []
     samples = common_samples(fits)
     return sorted(fits, key=lambda f: f.bic(samples))
-
-
-def rms_mm(fields: Sequence[np.ndarray]) -> float:
-    """Root mean square distance of residual fields (T, N, A) [m], in mm."""
-    squares = np.concatenate([(f**2).sum(2).ravel() for f in fields])
-    return 1e3 * float(np.sqrt(squares.mean()))
 
 
 def split_fields(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from masiv.inference.smooth_noise import SmoothNoise, covariance_of, estimate_smooth_noise
-from masiv.models.base import Observation
+from masiv.observations.base import Observation
 
 OBSERVATION_LIMITED_RATIO = 1.5
 """``residual_std`` over ``noise_std`` below which an instant is observation-limited."""

@@ -1,35 +1,64 @@
-"""What the loop asks of a simulation, whatever is simulated: a body filmed, a body with markers, a group of bodies."""
+r"""What every forward model is, and what is fitted through it.
+
+A forward model predicts an observation :math:`y_e(t_k, n)`, the place of point :math:`n` at instant :math:`t_k` of
+recording :math:`e`, from a ``Model`` and values :math:`\theta` of its parameters:
+
+.. math::  y_e = f_e(\theta_\text{law}, \theta_\text{effects}, \theta_e) + \varepsilon_e
+
+The law and the effects are shared by all recordings; :math:`\theta_e` (initial state, release, grid correction) belongs
+to one of them and is named ``parameter@recording``.
+"""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from masiv.effects.catalogue import effect_named
+from masiv.effects.context import EffectContext
+from masiv.models.families import Family
 from masiv.models.parameters import Parameter
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from masiv.effects.context import EffectContext
-    from masiv.inference.model_fit import ModelFit
-    from masiv.models.free_body import Model
-    from masiv.refine.config import RefineConfig
+Self = TypeVar("Self", bound="ForwardModel")
 
 
-Self = TypeVar("Self")
+@dataclass(frozen=True)
+class Model:
+    """A law's family (with the parameters to fit), how the ground holds the body, and effects by name."""
+
+    family: Family
+    contact: str
+    effects: tuple[str, ...] = ()
+
+    def with_effect(self, name: str) -> Model:
+        """The same with one effect more."""
+        return replace(self, effects=(*self.effects, name))
+
+
+class FittedModel(Protocol):
+    """A model with values of its parameters."""
+
+    @property
+    def model(self) -> Model: ...
+
+    @property
+    def values(self) -> Mapping[str, float]: ...
 
 
 @dataclass(frozen=True)
 class EffectTerm:
-    """An effect as it may be added to a model. name: that of the effect, followed by whom it acts on where that is not
-    everything; strengths: parameters that are zero where it is absent; others: its places, frequencies…; guesses:
-    values of the others to try in the score test; units by parameter; bodies: whom it acts on (none: everything);
-    stands_for: parameters of a model without it that it makes superfluous; kinked: see ``Effect``."""
+    """An effect as it may be added to a model.
+
+    name: that of the effect, followed by the bodies that it acts on unless it acts on all. strengths: parameters that
+    are zero if it is absent; others: its places, frequencies and so on. guesses: values of the others to try in the
+    score test. units: by parameter. bodies: that it acts on; empty: all. replaces_parameter: parameters of a model
+    without it that it makes superfluous. nonsmooth: see ``Effect``.
+    """
 
     name: str
     effect: str
@@ -43,6 +72,7 @@ class EffectTerm:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
+        """Strengths, then others."""
         return (*self.strengths, *self.others)
 
 
@@ -54,131 +84,36 @@ def effect_parameters(name: str) -> tuple[Parameter, ...]:
     )
 
 
-def plain_term(name: str, setting: EffectContext) -> EffectTerm:
+def plain_term(name: str, context: EffectContext) -> EffectTerm:
     """An effect of the library that acts on everything."""
     effect = effect_named(name)
     own = effect_parameters(name)
     units = {f"{name}.{p.name}": p.unit for p in effect.parameters}
     cut = effect.strengths
-    guesses = tuple(tuple(g) for g in effect.guesses(setting))
+    guesses = tuple(tuple(g) for g in effect.guesses(context))
     return EffectTerm(name, name, own[:cut], own[cut:], guesses, units, nonsmooth=effect.hints.nonsmooth)
 
 
-class Observation(Protocol):
-    """One experiment: K instants at which N points are compared, the first ``fit_count`` of them fitted, the rest held
-    out. noise [m]: of the observation; sigma (K,) [m]: by how much model and observation may differ with nothing
-    missing; grid_changes: what each finer grid changes (K, N, A) [m], none while that is not known.
-    ``dataclasses.replace`` gives it another sigma."""
+class ForwardModel(ABC):
+    """Predictions of models for ``observations`` (``masiv.observations.base.Observation``, names all different).
 
-    @property
-    def noise_std(self) -> float: ...
-
-    @property
-    def residual_std(self) -> np.ndarray: ...
-
-    @property
-    def grid_changes(self) -> tuple[np.ndarray, ...]: ...
-
-    @property
-    def time_count(self) -> int: ...
-
-    def whiten(self, field: np.ndarray) -> np.ndarray:
-        """A residual (K, N, A) [m] from the first instant on, in proportion to what it says."""
-        ...
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def fit_count(self) -> int: ...
-
-    @property
-    def holds_out(self) -> bool: ...
-
-    @property
-    def points(self) -> np.ndarray:
-        """Where the points are at the start (N, 3) [m]."""
-        ...
-
-    @property
-    def times(self) -> np.ndarray:
-        """Of the instants (T,) [s]."""
-        ...
-
-    @property
-    def points_in_world(self) -> np.ndarray:
-        """``points`` in the world frame."""
-        ...
-
-    @property
-    def values_in_world(self) -> np.ndarray:
-        """What was measured (T, N, A) [m], in the world frame along A of its axes."""
-        ...
-
-    def field_in_world(self, field: np.ndarray) -> np.ndarray:
-        """A residual (T, N, A) [m] along axes of the world frame."""
-        ...
-
-
-class WeightedResidual:
-    """A part of ``Observation``: residuals in proportion to what they say."""
-
-    noise_std: float
-    residual_std: np.ndarray
-    grid_changes: tuple[np.ndarray, ...] = ()
-
-    def whiten(self, field: np.ndarray) -> np.ndarray:
-        """A residual (K, N, A) [m] from the first instant on: as it is where sigma is the noise, less where the model
-        itself is less certain."""
-        return field * (self.noise_std / self.residual_std[: len(field), None, None])
-
-
-class WholeRunSplit(WeightedResidual):
-    """A part of ``Observation``: a run of which all or no instants are fitted."""
-
-    times: np.ndarray
-    observed: np.ndarray
-    fitted: bool
-
-    @property
-    def points(self) -> np.ndarray:
-        raise NotImplementedError
-
-    @property
-    def points_in_world(self) -> np.ndarray:
-        return self.points
-
-    @property
-    def values_in_world(self) -> np.ndarray:
-        return self.observed.reshape(len(self.observed), -1, self.observed.shape[-1])
-
-    def field_in_world(self, field: np.ndarray) -> np.ndarray:
-        return field
-
-    @property
-    def time_count(self) -> int:
-        return len(self.times)
-
-    @property
-    def fit_count(self) -> int:
-        return len(self.times) if self.fitted else 0
-
-    @property
-    def holds_out(self) -> bool:
-        return not self.fitted
-
-
-class SharedRollouts:
-    """A part of ``ForwardModel``: copies with other observations, which count their rollouts together."""
+    A subclass says what is fitted, which effects could act, and what it predicts. The other methods have answers that
+    hold for a model without a grid whose derivatives are good everywhere.
+    """
 
     observations: Sequence[Any]
 
-    def __init__(self) -> None:
+    def __init__(self, observations: Sequence[Any]) -> None:
+        """Raises ValueError if two observations have the same name: they would share parameters."""
+        names = [o.name for o in observations]
+        if len(set(names)) < len(names):
+            raise ValueError(f"observations need different names, these have {', '.join(names)}")
+        self.observations = tuple(observations)
         self._rollouts = [0]
 
     @property
     def rollouts(self) -> int:
-        """Rollouts so far, of this simulation and its copies."""
+        """Simulations so far, those of copies with other observations included."""
         return self._rollouts[0]
 
     @rollouts.setter
@@ -186,64 +121,55 @@ class SharedRollouts:
         self._rollouts[0] = count
 
     def with_observations(self: Self, observations: Sequence[Any]) -> Self:
-        """See ``ForwardModel``."""
+        """A copy that compares with ``observations``: the same, with another noise model or grid corrections. It shares
+        caches, held substeps and the count of rollouts with this one, which keeps its own observations."""
         out = copy.copy(self)
         out.observations = tuple(observations)
         return out
 
-
-class ForwardModel(Protocol):
-    """Residuals of models over experiments, and the parameters of a model."""
-
-    rollouts: int
-
-    @property
-    def observations(self) -> Sequence[Any]:
-        """Of ``Observation``."""
-        ...
-
-    def with_observations(self: Self, observations: Sequence[Any]) -> Self:
-        """A copy that compares with ``observations`` (the same, with another noise model or grid changes). It shares
-        caches, held substeps and the count of rollouts with this one, which keeps its own observations."""
-        ...
-
+    @abstractmethod
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
-        """Everything that is fitted: law, effects, and the start of each experiment."""
-        ...
+        """Everything that is fitted: law, effects, and what belongs to each recording."""
 
+    @abstractmethod
     def candidates(self, model: Model) -> Sequence[str]:
         """Names of the terms that ``model`` lacks and that could act here."""
-        ...
 
-    def term(self, name: str) -> EffectTerm: ...
+    @abstractmethod
+    def term(self, name: str) -> EffectTerm:
+        """The term of that name. Raises InputError for an unknown effect."""
 
+    @abstractmethod
     def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
-        """Simulated less observed (K, N, A) [m] of each experiment in the A axes that were measured: its fitted
-        instants, and the rest on request. Raises NonFiniteError."""
-        ...
+        """Predicted less observed (K, N, A) [m] of each recording: the fitted instants, and the rest if ``held_out``.
+        Raises NonFiniteError."""
 
     def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
-        """The fitted instants of all experiments, weighted, flat."""
-        ...
+        """The fitted instants of all recordings, whitened (``Observation.whiten``), flat (M,) [m]. Raises
+        NonFiniteError."""
+        found = zip(self.observations, self.fields(model, values), strict=True)
+        return np.concatenate([e.whiten(f).ravel() for e, f in found])
 
     def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
-        """What each of two or more finer grids changes, as a field over all instants of experiment ``index``; none:
-        there is no finer, or it tells nothing. All experiments have as many."""
-        ...
+        """What each of two or more finer grids changes (T, N, A) [m] of recording ``index``. Empty if there is no grid,
+        or if its change says nothing; all recordings have as many. Raises NonFiniteError."""
+        return []
 
     def reset_initial_conditions(self, values: Mapping[str, float]) -> dict[str, float]:
-        """``values`` with the start of each experiment as its first moments alone have it, where those are known."""
-        ...
+        """``values`` with the initial state of each recording as its first frames alone have it, if that is known."""
+        return dict(values)
 
-    def curriculum(self, base: ModelFit) -> Sequence[ForwardModel]:
-        """Shorter simulations through which refits go first, where ``base`` is so far off in the whole one that its
-        derivatives point nowhere; none otherwise."""
-        ...
+    def curriculum(self: Self, fields: Sequence[np.ndarray]) -> Sequence[Self]:
+        """Models of shorter parts of the recordings, to fit one after the other before the whole, if the residual
+        ``fields`` (T, N, A) [m] over all instants are so large that derivatives of the whole mislead. Else empty."""
+        return ()
 
-    def is_out_of_phase(self, base: ModelFit) -> bool:
-        """Whether ``base`` is so far off in this simulation that derivatives at it point nowhere."""
-        ...
+    def is_out_of_phase(self, fields: Sequence[np.ndarray]) -> bool:
+        """Whether the residual ``fields`` (T, N, A) [m] are so large that derivatives mislead, and no shorter part of
+        the recordings helps."""
+        return False
 
-    def objections(self, before: ModelFit, after: ModelFit, term: EffectTerm, config: RefineConfig) -> list[str]:
-        """Reasons of its own against adding ``term``."""
-        ...
+    def objections(self, before: FittedModel, after: FittedModel, term: EffectTerm, min_gain: float) -> list[str]:
+        """Reasons of physics, or of single bodies, against adding ``term``, in words. min_gain: part of the held-out
+        error that it must remove."""
+        return []

@@ -1,15 +1,14 @@
-"""Runs of one deformable body with markers, let go from rest: the simulations that refine's loop works on.
+"""A deformable body with markers that is let go from rest, in several runs: its law, effects, and how each began.
 
-They fulfil ``masiv.models.base.Simulated``. What is fitted beside the law and the effects is when each run was let
-go, since a reader knows it to a few milliseconds, and how far aside (horizontally) it was held; those of a held-out run
-are found from its own motion, and so are those of a run whose first moments are left out.
+What is fitted for a run is when it was let go, since a reader knows it to a few milliseconds, and how far from its rest
+it was held. Those of a held-out run are found from its own motion; so are those of a run whose first moments are left
+out.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,159 +20,148 @@ from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.effect import ClockEffect, ContactEffect, Effect, GeometryEffect
 from masiv.effects.per_body import DragBody
-from masiv.errors import InputError, MasivError, NonFiniteError
-from masiv.files import write_npz
-from masiv.inference.model_fit import ModelFit, rms_mm
-from masiv.materials.classical import ClassicalLaw
-from masiv.models.base import EffectTerm, SharedRollouts, WholeRunSplit
-from masiv.models.free_body import Model
-from masiv.models.marker_body import Plan, SimulatedBody, plan, simulated_body
+from masiv.materials.classical import UNITS, ClassicalLaw
+from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model
+from masiv.models.cache import Arrays, RolloutCache
+from masiv.models.deformable import HeldSubsteps, failures_as_divergence
+from masiv.models.marked_body import MarkedBody, marked_body
 from masiv.models.parameters import Parameter
-from masiv.models.release import clamp_axes, fit_release
+from masiv.models.release import fit_release
 from masiv.mpm.config import SimulatorConfig
-from masiv.mpm.rollout import rollout
-from masiv.refine.config import RefineConfig
+from masiv.observations.base import rms_mm
+from masiv.observations.tracks import TracksObservation, marker_observation
 from masiv.tracks.tracks import Run, Tracks
 from masiv.twin.from_tracks import drag_body
 
-RELEASE_REACH, RELEASE_STEP = 0.03, 1e-3
-OFFSET_REACH, OFFSET_STEP = 3e-3, 1e-4
-FINEST_OUTPUT = 2.5e-3
+RELEASE_RANGE, RELEASE_STEP = 0.03, 1e-3
+"""Of the delay of the release: range to either side and finite-difference step [s]."""
+OFFSET_RANGE, OFFSET_STEP = 3e-3, 1e-4
+"""Of the distance from the rest at which the body was held [m]."""
+DEFLECTION_RANGE, DEFLECTION_STEP = 0.2, 0.01
+"""Of the tip's deflection, in sizes of the body."""
+OUTPUT_INTERVAL = 2.5e-3
 """Time [s] between two states of a rollout that are kept; motion between them is a cubic spline."""
-STABLE = 1.3
-"""A law may become this much stiffer than the one that the substep is for: the Courant number leaves as much."""
-DEFLECTION_REACH, DEFLECTION_STEP = 0.2, 0.01
-"""In sizes of the body."""
-KEPT = 24
-LOST = 1.2
+KEPT_ROLLOUTS = 24
+PHASE_LOST = 1.2
 """Residual over the swing about its mean from which the phase is lost; of two swings in step it is less than 1."""
-BESIDE = 0.15
-"""How far from the body, in lengths of it, something that acts on it may be."""
+PLACE_MARGIN = 0.15
+"""How far from the body, in lengths of it, something that acts on it from outside may be."""
+NOT_SIMULATED = (GeometryEffect, ClockEffect)
+"""Effects that are no candidates: a body that rests in its clamp does not move with the ground, and a clock that is off
+is a release at another time."""
+MAX_MASS, MASS_STEP, FORCE_STEP, LENGTH_STEP = 30.0, 0.05, 0.05, 0.04
+"""Bound and finite-difference step of a mass in masses of the body, step of a force in its weights and of a length in
+its sizes."""
 
 
-@dataclass(frozen=True)
-class BodyRun(WholeRunSplit):
-    """A run from its release on: observed (K, M, 3) [m, world] of the markers tied to the body at ``times`` (K,) [s
-    since the release that the reader found], frames where one is not seen left out. speed [m/s]: their greatest;
-    noise [m], sigma (K,): see ``masiv.models.base.Observation``, the noise while the body is held; skip [s]: the
-    time after the release that is left out."""
-
-    name: str
-    condition: str
-    times: np.ndarray
-    observed: np.ndarray
-    body: SimulatedBody
-    fitted: bool
-    speed: float
-    noise_std: float
-    residual_std: np.ndarray
-    skip: float = 0.0
-
-    @property
-    def points(self) -> np.ndarray:
-        return self.body.markers_to_world(self.body.particles[None])[0]
-
-    @property
-    def starts(self) -> tuple[Parameter, ...]:
-        """How much later [s] it was let go, and how far [m] from its rest it was held along two horizontal axes.
-
-        Where its first moments are left out, also how far above its rest it was held, and an effective tip deflection
-        [m] at the start (see ``static_deflection``), for the energy that they took or gave."""
-        lateral = ("lateral_offset_1", "lateral_offset_2")
-        axes = lateral if not self.skip else (*lateral, "vertical_offset")
-        offsets = (Parameter(f"{axis}@{self.name}", 0.0, -OFFSET_REACH, OFFSET_REACH, OFFSET_STEP) for axis in axes)
-        bends = self.skip and clamp_axes(self.body.gravity, self.body.normals) is not None
-        deflection = (self._tip_deflection(),) if bends else ()
-        return (
-            Parameter(f"release@{self.name}", 0.0, -RELEASE_REACH, RELEASE_REACH, RELEASE_STEP),
-            *offsets,
-            *deflection,
-        )
-
-    def _tip_deflection(self) -> Parameter:
-        size = self.body.size
-        return Parameter(
-            f"tip_deflection@{self.name}",
-            0.0,
-            -DEFLECTION_REACH * size,
-            DEFLECTION_REACH * size,
-            DEFLECTION_STEP * size,
-        )
+def run_of_body(
+    tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, duration: float, skipped: float = 0.0
+) -> tuple[TracksObservation, MarkedBody]:
+    """``run`` from ``skipped`` to ``duration`` [s] after its release, and its body with particles ``spacing`` [m]
+    apart. Raises InputError."""
+    body = marked_body(tracks, run, config, particle_spacing=spacing)
+    points = body.markers_to_world(body.particles[None])[0]
+    speed = run.released(body.markers, skipped, duration)[2]
+    return marker_observation(run, body.markers, points, duration, skipped), replace(body, speed=speed)
 
 
-def body_run(
-    tracks: Tracks, run: Run, config: SimulatorConfig, spacing: float, duration: float, skip: float = 0.0
-) -> BodyRun:
-    """``run`` from ``skip`` to ``duration`` [s] after its release, with particles ``spacing`` [m] apart. Raises
-    InputError."""
-    body = simulated_body(tracks, run, config, particle_spacing=spacing)
-    markers = list(body.markers)
-    times, observed, speed = run.released(body.markers, skip, duration)
-    noise = 1e-6 if run.noise_std is None else max(float(np.sqrt((run.noise_std[markers] ** 2).sum(1).mean())), 1e-6)
-    residual_std = np.full(len(times), noise)
-    return BodyRun(run.name, run.condition, times, observed, body, run.purpose == "fit", speed, noise, residual_std,
-                   skip)  # fmt: skip
+class ClampedBodyModel(ForwardModel):
+    """Runs of one body.
 
+    It has no finer grids: over many periods two of them are out of phase, which would hide all else
+    (benchmarks/measured.md).
+    """
 
-class BodySimulation(SharedRollouts):
-    """Runs of one body. known: values of law and effects that are not fitted; contact: with the ground."""
+    observations: Sequence[TracksObservation]
 
     def __init__(
         self,
         tracks: Tracks,
-        runs: Sequence[BodyRun],
-        config: SimulatorConfig,
+        runs: Sequence[tuple[TracksObservation, MarkedBody]],
         *,
         known: Mapping[str, float] | None = None,
         horizons: Sequence[float] = (),
         folder: Path | None = None,
     ) -> None:
-        """runs: see ``body_run``; horizons [s]: how much of what is compared a search may look at first; folder: where
-        rollouts are kept, which are many and long."""
+        """runs: see ``run_of_body``. known: values of law and effects that are not fitted. horizons [s]: how much of
+        what is compared a curriculum begins with. folder: where rollouts are kept."""
+        super().__init__([observation for observation, _ in runs])
+        self.tracks = tracks
+        self.bodies = {observation.name: body for observation, body in runs}
+        self.known = dict(known or {})
         self.horizons = tuple(horizons)
         self.folder = folder
-        self.tracks = tracks
-        self.observations: Sequence[BodyRun] = tuple(runs)
-        self.config = config
-        self.known = dict(known or {})
-        self.outline: DragBody = drag_body(tracks, next(iter(tracks.bodies.values())))
-        self.ground = tracks.ground is not None
-        self.across = np.concatenate([np.linalg.svd(tracks.up[None])[2][1:], tracks.up[None]])
+        self.drag_body: DragBody = drag_body(tracks, next(iter(tracks.bodies.values())))
+        self.offset_axes = np.concatenate([np.linalg.svd(tracks.up[None])[2][1:], tracks.up[None]])
         """Two horizontal axes and the vertical one (3, 3), world."""
-        super().__init__()
-        self.substeps: dict[tuple[str, float], float] = {}
-        self.kept: dict[tuple, CubicSpline] = {}
+        self.held = HeldSubsteps()
+        self._rollout_cache = RolloutCache(KEPT_ROLLOUTS, folder)
 
-    def over(self, runs: Sequence[BodyRun]) -> BodySimulation:
-        """The same with other runs."""
-        return BodySimulation(self.tracks, runs, self.config, known=self.known, folder=self.folder)
+    @property
+    def contact(self) -> str:
+        """With the ground."""
+        return "sticky" if self.tracks.ground is not None else "none"
+
+    @property
+    def config(self) -> SimulatorConfig:
+        """Of the simulator."""
+        return self.body(self.observations[0]).config
+
+    def over(self, observations: Sequence[TracksObservation]) -> ClampedBodyModel:
+        """A model of other parts of the same runs, which holds a substep of its own."""
+        runs = [(o, self.bodies[o.name]) for o in observations]
+        return ClampedBodyModel(self.tracks, runs, known=self.known, folder=self.folder)
+
+    def body(self, run: TracksObservation) -> MarkedBody:
+        """The body of ``run`` at its place there."""
+        return self.bodies[run.name]
 
     # -- models -------------------------------------------------------------------------------------------------
 
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
         """Law, release of each fitted run, effects; without what is known.
 
-        The starts of a run whose first moments are left out are not among them: they are found from it for each model,
-        as those of a held-out run are (variable projection, Golub & Pereyra 1973), since a launch, a phase and a mass
-        that are fitted side by side lead into one another's way."""
+        The release of a run whose first moments are left out is not among them: it is found from the run for each
+        model, as that of a held-out run is (variable projection, Golub & Pereyra 1973), since an initial state, a phase
+        and a mass that are fitted together are strongly correlated."""
         every = [
             *model.family.parameters,
-            *(p for run in self.observations if run.fitted and not run.skip for p in run.starts),
+            *(p for run in self.observations if run.fitted and not run.skipped for p in self.release_parameters(run)),
             *(p for name in model.effects for p in self.term(name).parameters),
         ]
         return tuple(p for p in every if p.name not in self.known)
 
+    def release_parameters(self, run: TracksObservation) -> tuple[Parameter, ...]:
+        """The delay [s] of the release, and how far [m] from its rest the body was held along two horizontal axes.
+
+        If the first moments of ``run`` are left out, also how far above its rest it was held, and a deflection [m] of
+        its tip at the start (see ``static_deflection``) for the energy that they took or gave."""
+        names = ["lateral_offset_1", "lateral_offset_2"]
+        deflection: tuple[Parameter, ...] = ()
+        if run.skipped:
+            names.append("vertical_offset")
+            if self.body(run).clamp_axes is not None:
+                size = self.body(run).size
+                reach, step = DEFLECTION_RANGE * size, DEFLECTION_STEP * size
+                deflection = (Parameter(f"tip_deflection@{run.name}", 0.0, -reach, reach, step),)
+        release = Parameter(f"release@{run.name}", 0.0, -RELEASE_RANGE, RELEASE_RANGE, RELEASE_STEP)
+        offsets = (Parameter(f"{n}@{run.name}", 0.0, -OFFSET_RANGE, OFFSET_RANGE, OFFSET_STEP) for n in names)
+        return (release, *offsets, *deflection)
+
     def candidates(self, model: Model) -> list[str]:
-        """Effects that ``model`` lacks; a clock that is off is a release at another time, and so is fitted already."""
-        taken = not self.ground or any(isinstance(effect_named(n), ContactEffect) for n in model.effects)
-        out = []
-        for name, effect in causes().items():
-            on_ground = isinstance(effect, (ContactEffect, GeometryEffect))
-            clock = isinstance(effect, ClockEffect)
-            free = effect.hints.needs_clamp and not len(self.observations[0].body.heights)
-            if name not in model.effects and not clock and not (on_ground and taken) and not free:
-                out.append(name)
-        return out
+        """Effects that ``model`` lacks: at most one contact with the ground, none without a ground, those that need a
+        clamp if there is one, none of ``NOT_SIMULATED``."""
+        no_ground = self.tracks.ground is None
+        taken = no_ground or any(isinstance(effect_named(n), ContactEffect) for n in model.effects)
+        clamped = self.body(self.observations[0]).is_clamped
+        return [
+            name
+            for name, effect in causes().items()
+            if name not in model.effects
+            and not isinstance(effect, NOT_SIMULATED)
+            and not (isinstance(effect, ContactEffect) and taken)
+            and not (effect.hints.needs_clamp and not clamped)
+        ]
 
     def term(self, name: str) -> EffectTerm:
         """The effect, its steps in proportion to the body."""
@@ -181,191 +169,132 @@ class BodySimulation(SharedRollouts):
         declared = (effect.per_body or effect).parameters
         own = [self._parameter(effect, p) for p in declared]
         cut = effect.strengths
-        guesses = tuple(tuple(g) for g in effect.guesses(self._setting(self.observations[0])))
+        guesses = tuple(tuple(g) for g in effect.guesses(self._context(self.observations[0])))
         units = {f"{name}.{p.name}": p.unit for p in declared}
         return EffectTerm(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
 
     def _parameter(self, effect: Effect, p: EffectParameter) -> Parameter:
-        particles = self.observations[0].body.particles.numpy()
+        particles = self.body(self.observations[0]).particles.numpy()
         low, high = particles.min(0), particles.max(0)
         size = float((high - low).max())
+        mass = self.drag_body.mass
         lower, upper, step = p.lower, p.upper, p.step
         if p.unit == "kg":
-            upper, step = min(upper, 30 * self.outline.mass), 0.05 * self.outline.mass
+            upper, step = min(upper, MAX_MASS * mass), MASS_STEP * mass
         elif p.unit == "N":
-            step = 0.05 * self.outline.mass * float(np.linalg.norm(self.tracks.gravity))
+            step = FORCE_STEP * mass * float(np.linalg.norm(self.tracks.gravity))
         elif p.unit == "m":
-            step = 0.04 * size
+            step = LENGTH_STEP * size
             if p.name in "xyz":  # a place is in the body or at it
-                k, reach = "xyz".index(p.name), 0.0 if effect.hints.inside else BESIDE * size
+                k, reach = "xyz".index(p.name), 0.0 if effect.hints.inside else PLACE_MARGIN * size
                 lower, upper = float(low[k]) - reach, float(high[k]) + reach
         return Parameter(f"{effect.name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
 
-    def _setting(self, run: BodyRun) -> EffectContext:
+    def _context(self, run: TracksObservation) -> EffectContext:
         duration = float(run.times[-1])
-        return run.body.effects((), duration=duration, frame_time=duration / (len(run.times) - 1)).context
-
-    def _members(self, model: Model, values: Mapping[str, float]) -> tuple:
-        out = []
-        for name in model.effects:
-            effect = effect_named(name)
-            given = torch.tensor([values[p.name] for p in self.term(name).parameters], dtype=torch.float32)
-            out.append((effect, effect.per_body.of_body(given, self.outline) if effect.per_body else given))
-        return tuple(out)
+        return self.body(run).context(duration, duration / (len(run.times) - 1))
 
     def law(self, model: Model, values: Mapping[str, float]) -> ClassicalLaw:
         """The law among ``values`` and what is known."""
         both = {**self.known, **values}
-        names = {p.name for p in model.family.parameters} | (self.known.keys() & LAW_NAMES)
+        names = {p.name for p in model.family.parameters} | (self.known.keys() & UNITS.keys())
         return ClassicalLaw(model.family.kind, **{n: both[n] for n in names})
 
     # -- motion -------------------------------------------------------------------------------------------------
 
-    def planned(self, run: BodyRun, model: Model, values: Mapping[str, float], times: np.ndarray) -> Plan:
-        """How to simulate ``run`` to ``times`` (T,) [s]: by the substep of its first law. NonFiniteError for one
-        that is much stiffer."""
-        law = self.law(model, values)
-        planned = plan(run.body, law, times, self.config, speed=run.speed)
-        needed = planned.simulator.substep
-        held = self.substeps.setdefault((run.name, run.body.spacing), needed)
-        if needed * STABLE < held:
-            raise NonFiniteError(0, 0, f"the law needs substeps of {needed:.2g} s, not {held:.2g} s")
-        return plan(run.body, law, times, self.config, substep=held)
+    def substep(self, run: TracksObservation, model: Model, values: Mapping[str, float], times: np.ndarray) -> float:
+        """The substep [s] to simulate ``run`` with to ``times`` (T,) [s]: that of its first law. Raises NonFiniteError
+        for a law that is too stiff for it."""
+        body = self.body(run)
+        return self.held.take((run.name, body.spacing), body.substep(self.law(model, values), times))
 
-    def acting(self, run: BodyRun, model: Model, values: Mapping[str, float], duration: float) -> ActiveEffects:
-        """The effects of ``model``, and the clamp."""
-        frame_time = float(np.median(np.diff(run.times)))
-        members = self._members(model, {**self.known, **values})
-        return run.body.effects(members, duration=duration, frame_time=frame_time)
+    def acting(
+        self, run: TracksObservation, model: Model, values: Mapping[str, float], duration: float
+    ) -> ActiveEffects:
+        """The effects of ``model``, and the clamp, over ``duration`` [s]."""
+        both = {**self.known, **values}
+        members = []
+        for name in model.effects:
+            effect = effect_named(name)
+            given = torch.tensor([both[p.name] for p in self.term(name).parameters], dtype=torch.float32)
+            members.append((effect, effect.per_body.of_body(given, self.drag_body) if effect.per_body else given))
+        body = self.body(run)
+        return body.effects(members, body.context(duration, float(np.median(np.diff(run.times)))))
 
     @torch.no_grad()
-    def path(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> CubicSpline:
+    def path(self, run: TracksObservation, model: Model, values: Mapping[str, float]) -> CubicSpline:
         """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
-        both = {**self.known, **values}
-        deflection = values.get(f"tip_deflection@{run.name}", 0.0) if run.skip else 0.0
-        key = (
-            run.name,
-            float(run.times[-1]),
-            model.effects,
-            tuple(sorted((n, v) for n, v in both.items() if "@" not in n)),
-            *([deflection] if deflection else []),
-        )
-        if key in self.kept:
-            return self.kept[key]
-        file = self._file(run, model, key)
-        if file is not None and file.is_file():
-            with np.load(file) as saved:
-                self.substeps.setdefault((run.name, run.body.spacing), float(saved["substep"]))
-                self.kept[key] = CubicSpline(saved["times"], saved["markers"])
-            return self.kept[key]
-        last = float(run.times[-1]) + RELEASE_REACH
-        times = np.linspace(0, last, int(np.ceil(last / FINEST_OUTPUT)) + 1)
-        try:
-            planned = self.planned(run, model, values, times)
-            active = self.acting(run, model, values, last)
-            self.rollouts += 1
-            state = run.body.released(planned.simulator.dtype, deflection)
-            law = self.law(model, values)
-            positions = rollout(planned.simulator, law, state, planned.steps, planned.outputs, active)
-        except (InputError, NonFiniteError):
-            raise
-        except MasivError as failed:
-            raise NonFiniteError(0, 0, str(failed)) from failed
-        at = np.array(planned.outputs) * planned.simulator.substep
-        markers = run.body.markers_to_world(positions)
-        if file is not None:
-            write_npz(file, compressed=False, times=at, markers=markers, substep=planned.simulator.substep)
-        spline = CubicSpline(at, markers)
-        if len(self.kept) >= KEPT:
-            self.kept.pop(next(iter(self.kept)))
-        self.kept[key] = spline
-        return spline
+        body, law = self.body(run), self.law(model, values)
+        deflection = values.get(f"tip_deflection@{run.name}", 0.0) if run.skipped else 0.0
+        last = float(run.times[-1]) + RELEASE_RANGE
+        times = np.linspace(0, last, int(np.ceil(last / OUTPUT_INTERVAL)) + 1)
+        with failures_as_divergence():
+            substep = self.substep(run, model, values, times)
+            effects = self.acting(run, model, values, last)
+            acting = [(effect.name, theta) for effect, theta in effects.members]
+            context = effects.context
+            key = (
+                body.digest, body.contact, body.attachment, law.kind, sorted(law.values.items()), acting,
+                context.duration, context.frame_time, deflection, times, substep,
+            )  # fmt: skip
 
-    def _file(self, run: BodyRun, model: Model, key: tuple) -> Path | None:
-        """Where a rollout is kept on disk, so that a search that was killed goes on."""
-        if self.folder is None:
-            return None
-        held = self.substeps.get((run.name, run.body.spacing))
-        told = (
-            key,
-            model.family.kind,
-            len(run.body.particles),
-            run.body.spacing,
-            self.config.model_dump(),
-            held is None,
-        )
-        return self.folder / f"{hashlib.sha256(repr(told).encode()).hexdigest()[:24]}.npz"
+            def rolled_out() -> Arrays:
+                self.rollouts += 1
+                instants, positions = body.run(law, times, effects, substep=substep, deflection=deflection)
+                return {"times": instants, "markers": body.markers_to_world(positions)}
 
-    def markers(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> np.ndarray:
-        """Markers (K, M, 3) [m, world] of the model at the run's times."""
-        names = [p.name for p in run.starts]
+            found = self._rollout_cache.get(key, rolled_out)
+        return CubicSpline(found["times"], found["markers"])
+
+    def markers(self, run: TracksObservation, model: Model, values: Mapping[str, float]) -> np.ndarray:
+        """Markers (K, M, 3) [m, world] of the model at the run's times. Raises NonFiniteError."""
+        names = [p.name for p in self.release_parameters(run)]
         if not run.fitted or not all(name in values for name in names):
             return self.fit_release(run, model, values)[1]
         start = np.array([values[name] for name in names])
         path = self.path(run, model, values)
-        axes = self.across[: sum(not name.startswith(("release", "tip_deflection")) for name in names)]
+        axes = self.offset_axes[: sum("_offset" in name.split("@")[0] for name in names)]
         return path(np.clip(run.times - start[0], 0.0, None)) + start[1 : 1 + len(axes)] @ axes
 
-    def fit_release(self, run: BodyRun, model: Model, values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
-        """The values of ``run.starts`` that bring it nearest to its own motion, and its markers (K, M, 3) [m]."""
+    def fit_release(
+        self, run: TracksObservation, model: Model, values: Mapping[str, float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The values of ``release_parameters`` that bring ``run`` nearest to its own motion, and its markers (K, M, 3)
+        [m]. Raises NonFiniteError."""
 
         def path_at(deflection: float) -> CubicSpline:
             return self.path(run, model, {**values, f"tip_deflection@{run.name}": deflection})
 
-        return fit_release(run.starts, run.times, run.observed, self.across, path_at)
+        return fit_release(self.release_parameters(run), run.times, run.values, self.offset_axes, path_at)
 
     def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
-        """Simulated less observed (K, M, 3) [m, world] of each run; of a held-out run nothing but on request."""
+        """See ``ForwardModel``; (K, M, 3) [m, world]."""
         return [
-            self.markers(run, model, values) - run.observed
-            if run.fitted or held_out
-            else np.zeros((0, *run.observed.shape[1:]))
+            run.residual(self.markers(run, model, values) if run.fitted or held_out else run.values[:0])
             for run in self.observations
         ]
 
-    def residual(self, model: Model, values: Mapping[str, float]) -> np.ndarray:
-        """Of the fitted runs, weighted, flat."""
-        found = zip(self.observations, self.fields(model, values), strict=True)
-        return np.concatenate([run.whiten(f).ravel() for run, f in found])
-
-    def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
-        """None: over many periods two grids are out of phase, which would hide all else. See benchmarks/measured.md."""
-        return []
-
-    def reset_initial_conditions(self, values: Mapping[str, float]) -> dict[str, float]:
-        """As they are: no start is known but from a fit."""
-        return dict(values)
-
-    def curriculum(self, base: ModelFit) -> Sequence[BodySimulation]:
-        """The first moments, then ever more, where the phase is lost. None where they are left out: an effective start
+    def curriculum(self, fields: Sequence[np.ndarray]) -> Sequence[ClampedBodyModel]:
+        """The first moments, then ever more, if the phase is lost. Empty if those are left out: an effective start
         makes up for nearly any motion that is short."""
         runs = [run for run in self.observations if run.fitted]
-        if not self._out_of_phase(base) or any(run.skip for run in runs):
+        if not self._phase_lost(fields) or any(run.skipped for run in runs):
             return ()
-        return [self.over([shortened(run, horizon) for run in runs]) for horizon in self.horizons]
+        return [self.over([run.shortened(horizon) for run in runs]) for horizon in self.horizons]
 
-    def is_out_of_phase(self, base: ModelFit) -> bool:
+    def is_out_of_phase(self, fields: Sequence[np.ndarray]) -> bool:
         """Whether the phase is lost, and there are no first moments to count it from."""
-        return self._out_of_phase(base) and any(run.skip for run in self.observations)
+        return self._phase_lost(fields) and any(run.skipped for run in self.observations)
 
-    def _out_of_phase(self, base: ModelFit) -> bool:
+    def _phase_lost(self, fields: Sequence[np.ndarray]) -> bool:
         """Whether the residual is as large as the swing."""
-        swing = [run.observed - run.observed.mean(0) for run in self.observations if run.fitted]
-        return base.fit_mm >= LOST * rms_mm(swing)
+        swing = [run.values - run.values.mean(0) for run in self.observations if run.fitted]
+        fitted = [field[: run.fit_count] for run, field in zip(self.observations, fields, strict=True)]
+        return rms_mm(fitted) >= PHASE_LOST * rms_mm(swing)
 
-    def objections(self, before: ModelFit, after: ModelFit, term: EffectTerm, config: RefineConfig) -> list[str]:
+    def objections(self, before: FittedModel, after: FittedModel, term: EffectTerm, min_gain: float) -> list[str]:
         """What the medium cannot do."""
         theta = torch.tensor([after.values[p.name] for p in term.parameters], dtype=torch.float64)
         per_body = effect_named(term.effect).per_body
-        why = per_body.violates_bounds(theta, self.outline) if per_body else None
+        why = per_body.violates_bounds(theta, self.drag_body) if per_body else None
         return [] if why is None else [why]
-
-
-LAW_NAMES = frozenset({"youngs_modulus", "poissons_ratio", "yield_stress", "friction_angle", "viscosity",
-                       "bulk_modulus", "shear_modulus", "plastic_viscosity"})  # fmt: skip
-
-
-def shortened(run: BodyRun, duration: float) -> BodyRun:
-    """The first ``duration`` [s] of what is compared of a run."""
-    kept = run.times <= run.skip + duration
-    return replace(run, times=run.times[kept], observed=run.observed[kept], residual_std=run.residual_std[kept])

@@ -1,23 +1,17 @@
-"""The classical families that can be fitted: their parameters, where to look for them, and what they make of a motion.
+"""The classical families of laws that can be fitted: their parameters, and where a search starts.
 
-The five of PAC-NeRF (Li et al. 2023) and GIC (Cai et al. 2024). Light searches start from the values here, given for
-1000 kg/m^3: what moves a body is a modulus over its density.
+The five of PAC-NeRF (Li et al. 2023) and GIC (Cai et al. 2024). Values are for 1000 kg/m^3: what moves a body is a
+modulus over its density.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
-import numpy as np
-import torch
-
-from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.classical import UNITS, ClassicalLaw
-from masiv.models.initial_state import InitialState
 from masiv.models.parameters import Parameter
-from masiv.models.problem import Problem
 
 MODULUS = Parameter("youngs_modulus", 3e4, 3e2, 1e7, 0.05, log=True)
 RATIO = Parameter("poissons_ratio", 0.3, 0.0, 0.48, 0.01)
@@ -26,7 +20,8 @@ YIELD = Parameter("yield_stress", 1e3, 3.0, 1e6, 0.05, log=True)
 
 @dataclass(frozen=True)
 class Family:
-    """parameters of a ``ClassicalLaw`` and the values of some of them that a coarse search tries, all with all."""
+    """parameters of a ``ClassicalLaw``; search: the values of some of them that a coarse search tries, in all
+    combinations."""
 
     kind: str
     parameters: tuple[Parameter, ...]
@@ -40,7 +35,7 @@ class Family:
             return share if UNITS[name].startswith("Pa") else 1.0
 
         parameters = tuple(
-            dataclasses.replace(p, **{f: getattr(p, f) * factor(p.name) for f in ("start", "lower", "upper")})
+            replace(p, **{f: getattr(p, f) * factor(p.name) for f in ("start", "lower", "upper")})
             for p in self.parameters
         )
         return Family(self.kind, parameters, {n: tuple(v * factor(n) for v in vs) for n, vs in self.search.items()})
@@ -90,51 +85,12 @@ FAMILIES = {
 }
 
 
-def law_of(family: Family, values: dict[str, float]) -> ClassicalLaw:
+def law_of(family: Family, values: Mapping[str, float]) -> ClassicalLaw:
     """The law among ``values``."""
     return ClassicalLaw(family.kind, **{p.name: values[p.name] for p in family.parameters})
 
 
-class Rollouts:
-    """Residuals of ``values`` (law and throw) over the first ``frames``: (K, N, 3) [m], simulated less observed.
-
-    All take the number of substeps that the first law needs, softer ones too: what a grid loses depends on it by
-    millimetres, and a jump would be mistaken for a derivative. A law too stiff for it is refused, as one that diverges.
-    """
-
-    STABLE = 1.4
-    """Substeps that a law may need over those taken: the configured Courant number leaves as much."""
-
-    def __init__(self, problem: Problem, family: Family, contact: str, frames: int) -> None:
-        self.problem = problem
-        self.family = family
-        self.contact = contact
-        self.frames = frames
-        self.steps = 0
-
-    @torch.no_grad()
-    def field(self, values: dict[str, float]) -> np.ndarray:
-        """Raises NonFiniteError where the rollout diverges, spreads without bound or is too stiff to be simulated."""
-        law = law_of(self.family, values)
-        try:
-            if self.steps == 0:
-                self.steps = self.problem.substeps(law)
-            needed = self.problem.least_substeps(law)
-            if needed > self.STABLE * self.steps:
-                raise NonFiniteError(0, 0, f"the law needs {needed} substeps a frame, {self.steps} are taken")
-            positions = self.problem.run(
-                law, InitialState.of_values(values), self.contact, self.frames, steps=self.steps
-            )
-        except (InputError, NonFiniteError):
-            raise
-        except MasivError as failed:
-            raise NonFiniteError(0, 0, str(failed)) from failed
-        return (positions - self.problem.targets[: len(positions)]).double().numpy()
-
-    def __call__(self, values: dict[str, float]) -> np.ndarray:
-        return self.field(values).ravel()
-
-
-def mean_distance(field: np.ndarray) -> float:
-    """Mean distance [m] of a residual field (K, N, 3)."""
-    return float(np.linalg.norm(field, axis=2).mean())
+def family_of(kind: str, density: float, known: Mapping[str, float]) -> Family:
+    """The family for a body of ``density`` [kg/m^3] without the parameters that are ``known``."""
+    family = FAMILIES[kind].scaled(density)
+    return replace(family, parameters=tuple(p for p in family.parameters if p.name not in known))

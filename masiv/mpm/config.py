@@ -14,8 +14,8 @@ class SimulatorConfig(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     particles_per_cell: float = Field(6.0, gt=0.5, le=64, description="sets the grid spacing from the particle spacing")
-    split: Literal[1, 4, 8] = Field(
-        4, description="particles into which each one is split for a prediction, on the same grid; a fit takes it whole"
+    subparticles: Literal[1, 4, 8] = Field(
+        4, description="particles into which each one is subdivided for a prediction, on the same grid; not for a fit"
     )
     courant_number: float = Field(0.3, gt=0, le=0.8, description="cells that sound and matter may cross in a substep")
     max_substeps_per_frame: int = Field(400, ge=1, description="a stiffer law than this allows is an error")

@@ -118,7 +118,7 @@ def _relearn(run: VideoRun, twin: Twin, progress: Progress) -> Twin:
 
 def _delete_artefacts_of_twin(run: RunFolder) -> None:
     """Delete what describes a twin that is about to change, so that a killed run holds nothing outdated."""
-    from masiv.report.material import MATERIAL
+    from masiv.report.sections.material import MATERIAL
 
     for path in (run.rollout, run.metrics, run.path / MATERIAL):
         path.unlink(missing_ok=True)
@@ -126,9 +126,9 @@ def _delete_artefacts_of_twin(run: RunFolder) -> None:
 
 def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: Progress) -> None:
     """Write report.html, and before it what the run lacks of rollout, material.json and metrics.json."""
-    from masiv.report.material import MATERIAL
     from masiv.report.numbers import material_numbers, run_numbers
-    from masiv.report.report import write_report
+    from masiv.report.sections.material import MATERIAL
+    from masiv.report.video import write_report
     from masiv.simulation.simulate import simulate
     from masiv.twin import Twin
 

@@ -14,7 +14,7 @@ from masiv.errors import InputError
 from masiv.observations.read import read_scene
 from masiv.progress import Progress, silent
 from masiv.report.history import logged
-from masiv.report.material import MATERIAL
+from masiv.report.sections.material import MATERIAL
 from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
 

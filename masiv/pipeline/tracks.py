@@ -11,13 +11,13 @@ from urllib.parse import quote
 from masiv.config import Config
 from masiv.errors import InputError
 from masiv.files import write_json, write_npz
+from masiv.observations.identity import identity
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
 from masiv.pipeline.run import Run, settings
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder
 from masiv.strict import read_yaml
 from masiv.tracks.read import read_tracks
-from masiv.tracks.summary import identity
 from masiv.tracks.tracks import Tracks
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ class TracksRun(Run):
         report.html. Returns the errors of each run."""
         from masiv.identify.twin_over_runs import run_errors, simulated
         from masiv.refine.document import with_scopes
-        from masiv.report.tracks_page import write_page
+        from masiv.report.tracks import write_report
         from masiv.twin.identified import IDENTIFIED_FILE, load_identified
 
         twins = {"before": twin}
@@ -216,7 +216,7 @@ class TracksRun(Run):
         )
         files = [self.path / f"{refine_stem(c, self._conditions[0])}.json" for c in self._conditions]
         refined = [with_scopes(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
-        write_page(self.folder.report, self.tracks, twin, errors, curves, refined)
+        write_report(self.folder.report, self.tracks, twin, errors, curves, refined)
         return errors
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from masiv.config import Config
 from masiv.errors import InputError
 from masiv.files import write_json
+from masiv.observations.identity import identity
 from masiv.observations.read import read_scene
 from masiv.pipeline import stages
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
@@ -16,7 +17,6 @@ from masiv.pipeline.run import Run, reopen_run, settings
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder
 from masiv.scene.scene import Scene
-from masiv.scene.summary import identity
 
 
 class VideoRun(Run):
@@ -79,7 +79,7 @@ class VideoRun(Run):
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
         from masiv.report.numbers import law_text, material_numbers, run_numbers, table
-        from masiv.report.report import write_report
+        from masiv.report.video import write_report
         from masiv.simulation.simulate import simulate
 
         folder, scene = self.folder, self.scene

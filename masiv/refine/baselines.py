@@ -13,10 +13,10 @@ from masiv.identify.losses.objective import Objective
 from masiv.inference.least_squares import linearize, with_start_values
 from masiv.inference.model_fit import ModelFit, evaluate_fit, gauss_newton_fit, residual_of
 from masiv.inference.robust import robust_scale_of
+from masiv.models.base import Model
 from masiv.models.families import FAMILIES
-from masiv.models.free_body import Model, Simulation
+from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
 from masiv.refine.search import fits_of
@@ -34,13 +34,13 @@ class BaselineProblem:
     """The fitted frames of the first observation. coarse: on the particles of the search; coarser: on fewer;
     first_frames: frames of the first fit, free flight and first contact."""
 
-    coarse: Problem
-    coarser: Problem
+    coarse: Objective
+    coarser: Objective
     first_frames: int
 
 
 def baselines(
-    forward_model: Simulation,
+    forward_model: FreeBodyModel,
     problem: BaselineProblem,
     config: RefineConfig,
     checkpoint: Checkpoint,
@@ -66,22 +66,22 @@ LABEL = "refine: laws without effects"
 
 
 def _shortlist(
-    forward_model: Simulation, problem: BaselineProblem, kinds: Sequence[str], config: RefineConfig, progress: Progress,
-    workers: Workers,
+    forward_model: FreeBodyModel, problem: BaselineProblem, kinds: Sequence[str], config: RefineConfig,
+    progress: Progress, workers: Workers,
 ) -> list[str]:  # fmt: skip
     """The laws that are best in a short fit."""
-    motion = forward_model.observations[0].motion
+    motion = forward_model.setups[0].start
     tasks = [(kind, problem.coarser, motion, problem.first_frames, SHORT_BUDGET) for kind in kinds]
     short = list(_known(kinds, workers.map(_fit_family, tasks), progress))
     return [f.kind for f in rank_by_bic(_some(short))[: config.families]]
 
 
 def _fitted(
-    forward_model: Simulation, problem: BaselineProblem, kinds: Sequence[str], checkpoint: Checkpoint,
+    forward_model: FreeBodyModel, problem: BaselineProblem, kinds: Sequence[str], checkpoint: Checkpoint,
     progress: Progress, workers: Workers,
 ) -> list[FamilyFit]:  # fmt: skip
     """Fits of the laws ``kinds``, those in the checkpoint taken from there."""
-    motion = forward_model.observations[0].motion
+    motion = forward_model.setups[0].start
     states = (checkpoint.load() or {}).items()
     saved = {kind: FamilyFit(**state) for kind, state in states if state["stage"] >= ALL_FRAMES_STAGE}
     missing = [kind for kind in kinds if kind not in saved]
@@ -92,8 +92,8 @@ def _fitted(
     return _some([saved[kind] for kind in kinds if kind in saved])
 
 
-def _fit_family(kind: str, problem: Problem, motion: InitialState, first_frames: int, budget: float) -> FamilyFit:
-    return fit_family(kind, Objective(problem), motion, first_frames, Checkpoint(None), silent, budget_factor=budget)
+def _fit_family(kind: str, objective: Objective, motion: InitialState, first_frames: int, budget: float) -> FamilyFit:
+    return fit_family(kind, objective, motion, first_frames, Checkpoint(None), silent, budget_factor=budget)
 
 
 def _known(kinds: Sequence[str], results: Iterable[FamilyFit | TaskError], progress: Progress) -> Iterator[FamilyFit]:
@@ -112,18 +112,18 @@ def _some(fits: list[FamilyFit]) -> list[FamilyFit]:
     return fits
 
 
-def _start(forward_model: Simulation, fit: FamilyFit) -> tuple[Model, dict[str, float]]:
+def _start(forward_model: FreeBodyModel, fit: FamilyFit) -> tuple[Model, dict[str, float]]:
     """The model that fits the first observation, and its values, to start from in all."""
     first = forward_model.observations[0]
-    family = FAMILIES[fit.kind].scaled(first.problem.scene.density)
+    family = FAMILIES[fit.kind].scaled(forward_model.setups[0].body.scene.density)
     law = {p.name for p in family.parameters}
     values = {name if name in law else f"{name}@{first.name}": value for name, value in fit.values.items()}
     model = Model(family, fit.contact)
-    forward_model.settle(model, values)
+    forward_model.hold_substeps(model, values)
     return model, values
 
 
-def differentiated(forward_model: Simulation, model: Model, values: dict[str, float], budget: int) -> ModelFit:
+def differentiated(forward_model: FreeBodyModel, model: Model, values: dict[str, float], budget: int) -> ModelFit:
     """``values`` with derivatives; fitted to all observations in ``budget`` rollouts if there are several. Raises
     NonFiniteError."""
     if len(forward_model.observations) > 1:

@@ -74,7 +74,7 @@ def score(
     If ``base`` is out of phase with what was observed, a derivative says nothing of a strength that would bring it into
     phase: some finite strengths of each guess are rolled out instead."""
     test = ScoreTest.of(forward_model, base, robust_scale)
-    finite = forward_model.is_out_of_phase(base)
+    finite = forward_model.is_out_of_phase(base.fields)
     candidates, not_ranked = [], {}
     todo = [n for n in names if n not in base.model.effects]
     for done, name in enumerate(todo):

@@ -11,9 +11,10 @@ import numpy as np
 
 from masiv.effects.catalogue import effect_named
 from masiv.files import write_npz
-from masiv.inference.model_fit import ModelFit, rms_mm, split_fields
+from masiv.inference.model_fit import ModelFit, split_fields
 from masiv.models.base import EffectTerm
-from masiv.models.free_body import GRID_CHANGE
+from masiv.models.free_body import GRID_CORRECTION
+from masiv.observations.base import rms_mm
 from masiv.refine.answer import answer
 from masiv.refine.candidates import Candidate
 from masiv.refine.result import ADDED, NOTHING, BodyResult, Proposal, RefineResult, SharedFit
@@ -83,7 +84,7 @@ def _discretization_mm(result: RefineResult) -> dict[str, float | None]:
 
 def _grid_change(result: RefineResult, fitted: ModelFit) -> float | None:
     """Factor of what finer grids change on average, mean over the observations; None if it was not fitted."""
-    factors = [fitted.values.get(f"{GRID_CHANGE}@{e.name}") for e in result.observations]
+    factors = [fitted.values.get(f"{GRID_CORRECTION}@{e.name}") for e in result.observations]
     known = [f for f in factors if f is not None]
     return float(np.mean(known)) if known else None
 

@@ -62,7 +62,7 @@ def objections_to(
     """Why ``term``, by which ``after`` is richer than ``before``, is not accepted; empty if it is."""
     noise = NoiseModel(forward_model.observations)
     general = statistical_objections(before, after, term, noise, config)
-    return [*general, *forward_model.objections(before, after, term, config)]
+    return [*general, *forward_model.objections(before, after, term, config.min_gain)]
 
 
 def statistical_objections(

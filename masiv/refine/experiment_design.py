@@ -8,7 +8,7 @@ import numpy as np
 
 from masiv.errors import NonFiniteError
 from masiv.inference.model_fit import ModelFit, rank_by_bic
-from masiv.models.free_body import Simulation
+from masiv.models.free_body import FreeBodyModel
 from masiv.progress import Progress
 from masiv.refine.result import Proposal
 from masiv.refine.rounds import MIN_BIC_GAP, Round, SearchResult
@@ -32,13 +32,13 @@ def propose(search: SearchResult, progress: Progress) -> Proposal | None:
     rival = _rival(first, best)
     if rival is None:
         return None
-    forward_model = cast(Simulation, search.forward_model)
+    forward_model = cast(FreeBodyModel, search.forward_model)
     observation = forward_model.observations[0]
-    axes, suffix = observation.problem.axes, f"@{observation.name}"
+    body = forward_model.setups[0].body
+    axes, suffix = body.axes, f"@{observation.name}"
 
     def difference_mm(state: dict[str, float]) -> float:
-        frames = observation.problem.frames
-        a, b = (forward_model.positions(f.model, {**f.values, **state}, 0, frames) for f in (best, rival))
+        a, b = (forward_model.positions(f.model, {**f.values, **state}, 0, body.frames) for f in (best, rival))
         return 1e3 * float((a - b).square().sum(2).mean().sqrt())
 
     differences, failures = [], []

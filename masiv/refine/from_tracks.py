@@ -9,11 +9,13 @@ from masiv import runtime
 from masiv.config import Config
 from masiv.errors import InputError
 from masiv.identify.from_tracks import group_of
-from masiv.identify.tracks import conditions, family_of, only_body, runs_of, simulation_of
+from masiv.identify.tracks import conditions, only_body, runs_of, simulation_of
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.free_body import Model
-from masiv.models.point_mass import PointSimulation, point_runs
+from masiv.models.base import Model
+from masiv.models.families import family_of
+from masiv.models.point_mass import PointMassModel
+from masiv.observations.tracks import flight_observations
 from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
 from masiv.refine.pooling import refine_bodies
@@ -74,7 +76,7 @@ def check_config(config: Config) -> None:
 def refine_group(tracks: Tracks, group: str, settings: SearchSettings) -> RefineResult:
     """The flights of the bodies of ``group``. Raises InputError if a body has no run to fit or none that is held
     out."""
-    forward_model = PointSimulation(tracks, point_runs(tracks, group))
+    forward_model = PointMassModel(tracks, flight_observations(tracks, group))
     for body in forward_model.bodies:
         if {run.fitted for run in forward_model.observations if run.body == body} != {True, False}:
             raise InputError(f"{tracks.path}: body {body} needs a run to fit and one with `use: hold_out` to judge by")
@@ -100,7 +102,7 @@ def _refine_body(
         known = {**law, **{n: v for e in acting for n, v in effect_values(e, e.name).items()}}
     forward_model = simulation_of(tracks, condition, config.tracks, config.simulator, known=known, folder=folder)
     family = family_of(twin.law.kind, only_body(tracks).density or 1e3, known)
-    model = Model(family, "sticky" if forward_model.ground else "none", effects)
+    model = Model(family, forward_model.contact, effects)
     settings.progress("refine: without effects", 0, 1)
     base = gauss_newton_fit(forward_model, model, {**law, **start_values(twin)}, budget=config.tracks.rollouts)
     settings.progress("refine: without effects", 1, 1, f"{base.fit_mm:.2f} mm")

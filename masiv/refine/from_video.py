@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
-from masiv.models.free_body import Simulation
-from masiv.models.prepare import video_observation
+from masiv.models.free_body import FreeBodyModel
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import Observed, first_frames
 from masiv.progress import Progress, silent
 from masiv.refine.baselines import BaselineProblem, baselines
 from masiv.refine.config import RefineConfig
 from masiv.refine.experiment_design import propose
+from masiv.refine.prepare import prepare
 from masiv.refine.result import RefineResult
 from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import check_effects, refine
@@ -84,14 +84,12 @@ def refine_recordings(
         config = config.model_copy(update={"laws": list(COMPETITORS[start])})
     with runtime.torch_threads(1), Workers(process_count(config.processes)) as workers:
         prepared = [
-            video_observation(
-                r.name, r.scene, first_frames(r.motion, r.fit_frames), r.whole, identify, simulator, config
-            )
+            prepare(r.name, r.scene, first_frames(r.motion, r.fit_frames), r.whole, identify, simulator, config)
             for r in with_unique_names(recordings)
         ]
-        forward_model = Simulation([observation for observation, *_ in prepared])
+        forward_model = FreeBodyModel([setup for setup, *_ in prepared])
         _, coarse, coarser, initial_motion = prepared[0]
-        problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.frames))
+        problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.problem.frames))
         fits = baselines(forward_model, problem, config, checkpoint or Checkpoint(None), progress, workers)
         settings = SearchSettings.of(config, rank_only=dry_run, workers=workers, progress=progress)
         result = refine(forward_model, fits, settings)

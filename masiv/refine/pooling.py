@@ -12,9 +12,8 @@ from masiv.errors import MasivError
 from masiv.identify.flights import fit_flights
 from masiv.inference.model_fit import ModelFit, gauss_newton_fit
 from masiv.inference.robust import robust_scale_of
-from masiv.models.base import EffectTerm
-from masiv.models.free_body import Model
-from masiv.models.point_mass import PointSimulation
+from masiv.models.base import EffectTerm, Model
+from masiv.models.point_mass import PointMassModel
 from masiv.refine.config import RefineConfig
 from masiv.refine.evidence import objections_to
 from masiv.refine.result import BodyResult, RefineResult, SharedFit
@@ -23,7 +22,7 @@ from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import refine
 
 
-def refine_bodies(forward_model: PointSimulation, settings: SearchSettings) -> RefineResult:
+def refine_bodies(forward_model: PointMassModel, settings: SearchSettings) -> RefineResult:
     """Which effects do the flights of several bodies lack?
 
     An effect of the surroundings is one for all bodies. One that depends on the body is tried for all with one
@@ -47,7 +46,7 @@ def refine_bodies(forward_model: PointSimulation, settings: SearchSettings) -> R
 class _Pool:
     """The outcome of a search over several bodies, to be worked out for each by itself."""
 
-    forward_model: PointSimulation
+    forward_model: PointMassModel
     search: SearchResult
     config: RefineConfig
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from masiv.inference.model_fit import ModelFit
 from masiv.inference.noise_model import NoiseModel
-from masiv.models.base import EffectTerm, ForwardModel, Observation
+from masiv.models.base import EffectTerm, ForwardModel
+from masiv.observations.base import Observation
 from masiv.refine.config import RefineConfig
 from masiv.refine.rounds import SearchResult
 

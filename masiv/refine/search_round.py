@@ -119,7 +119,7 @@ class _Start:
     @classmethod
     def of(cls, state: SearchState, base: ModelFit) -> _Start:
         model = state.forward_model
-        curriculum, fit = tuple(model.curriculum(base)), base
+        curriculum, fit = tuple(model.curriculum(base.fields)), base
         if curriculum:  # what comes late in such a motion draws a fit of all of it away from the beginning, too
             values = model.reset_initial_conditions(base.values)
             fit = warm_started_fit(curriculum[0], replace(base, values=values), state.robust_scale)
@@ -284,7 +284,7 @@ def dominated_by(state: SearchState, trial: Trial, trials: Sequence[Trial], sett
             and other.effect != trial.effect
             and len(other.fitted.parameters) <= len(trial.fitted.parameters)
             and other.fitted.bic(samples) < trial.fitted.bic(samples) - MIN_BIC_GAP
-            and not model.objections(state.fit, other.fitted, model.term(other.effect), settings.config)
+            and not model.objections(state.fit, other.fitted, model.term(other.effect), settings.config.min_gain)
         ):
             return [f"{other.effect} explains more with no more parameters, and is not certain"]
     return []

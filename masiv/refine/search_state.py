@@ -10,8 +10,7 @@ import numpy as np
 from masiv.inference.discretization import with_residual_std
 from masiv.inference.model_fit import ModelFit, warm_started_fit
 from masiv.inference.noise_model import NoiseModel
-from masiv.models.base import ForwardModel
-from masiv.models.free_body import Model
+from masiv.models.base import ForwardModel, Model
 from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
 from masiv.workers import Workers

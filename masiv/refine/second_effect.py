@@ -131,7 +131,7 @@ def objections_to_pair(
         if not z >= config.min_strength_z:
             out.append(f"{name} is {z:.1f} standard errors from zero, less than {config.min_strength_z:g}")
         out += parameters_at_bounds(after, term)
-        out += forward_model.objections(before, after, term, config)
+        out += forward_model.objections(before, after, term, config.min_gain)
     noise = NoiseModel(forward_model.observations)
     was, now = (noise.held_out(f.squares) for f in (before, after))
     clear = gain >= config.clear_bic_gain

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from masiv.observations.identity import identity
 from masiv.report.contact_sheet import write_contact_sheet
 from masiv.scene.scene import Scene
 from masiv.scene.summary import as_text, summarise
@@ -19,5 +20,5 @@ def inspection(read: Scene | Tracks, picture: Path) -> tuple[dict[str, Any], str
         summary = {**summarise_tracks(read), "picture": str(picture)}
         return summary, tracks_as_text(summary)
     write_contact_sheet(read, picture)
-    summary = {**summarise(read), "picture": str(picture)}
+    summary = {**summarise(read), **identity(read), "picture": str(picture)}
     return summary, as_text(summary)

@@ -13,7 +13,7 @@ from masiv import metrics
 from masiv.progress import Progress, silent
 from masiv.report import measure
 from masiv.report.follow import Binding
-from masiv.report.material import read_material
+from masiv.report.sections.material import read_material
 from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
 

@@ -1,8 +1,7 @@
-"""Summary of a scene for ``masiv inspect``, and its identity for run folders."""
+"""Summary of a scene for ``masiv inspect``."""
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,8 @@ import numpy as np
 from masiv.scene.scene import Scene
 
 
-def identity(scene: Scene) -> dict[str, Any]:
-    """Identity of a scene: conventions, a hash of the cameras and one of the first and the last picture."""
-    cameras, pictures = hashlib.sha256(), hashlib.sha256()
-    for camera in scene.cameras:
-        cameras.update(np.round([*camera.intrinsics.ravel(), *camera.world_to_camera.ravel()], 6).tobytes())
-    visible = scene.views
-    for view, frame in ((visible[0], 0), (visible[-1], scene.frame_count - 1)):
-        pictures.update(scene.frame(view, frame).image.tobytes())
-        pictures.update(scene.frame(view, frame).mask.tobytes())
+def conventions(scene: Scene) -> dict[str, Any]:
+    """Layout, time, axes, gravity, ground and density of a scene, as plain values."""
     ground = None
     if scene.ground is not None:
         ground = {"normal": scene.ground.normal.tolist(), "height_m": float(scene.ground.height)}
@@ -32,8 +24,6 @@ def identity(scene: Scene) -> dict[str, Any]:
         "ground": ground,
         "density_kg_m3": float(scene.density),
         "mask_source": scene.mask_source,
-        "cameras_sha256": cameras.hexdigest()[:16],
-        "pictures_sha256": pictures.hexdigest()[:16],
     }
 
 
@@ -57,7 +47,7 @@ def summarise(scene: Scene) -> dict[str, Any]:
     coverage = coverage[seen] if seen.any() else coverage
     return {
         "scene": str(scene.path),
-        **identity(scene),
+        **conventions(scene),
         "duration_s": (scene.frame_count - 1) / scene.fps,
         "fit_frames": scene.fit_frames,
         "mask_coverage": {"mean": coverage.mean(), "min": coverage.min(), "max": coverage.max()},

@@ -11,8 +11,8 @@ import numpy as np
 from masiv.inference.model_fit import ModelFit
 from masiv.materials.classical import PARAMETERS, ClassicalLaw
 from masiv.models.base import EffectTerm, ForwardModel
-from masiv.models.clamped_body import BodySimulation
-from masiv.models.free_body import Simulation, initial_state_of
+from masiv.models.clamped_body import ClampedBodyModel
+from masiv.models.free_body import FreeBodyModel
 from masiv.scene.scene import Ground
 from masiv.twin import Boundary, InitialCondition, Twin, TwinEffect
 from masiv.twin.body import with_start_values
@@ -74,33 +74,33 @@ def _effect(
 def place_of(forward: ForwardModel, name: str, fitted: ModelFit) -> tuple[float, float, float] | None:
     """The place of an effect in the body's own axes [m]; None if it has none, or if those axes are not known."""
     values = [fitted.values.get(f"{name}.{axis}") for axis in "xyz"]
-    if not isinstance(forward, BodySimulation) or any(value is None for value in values):
+    if not isinstance(forward, ClampedBodyModel) or any(value is None for value in values):
         return None
     first = forward.observations[0]
     placement = next(run for run in forward.tracks.runs if run.name == first.name).placement
     if placement is None:
         return None
-    x, y, z = placement.to_own(first.body.frame.points_to_world(np.array(values, dtype=float)))
+    x, y, z = placement.to_own(forward.body(first).axes.points_to_world(np.array(values, dtype=float)))
     return float(x), float(y), float(z)
 
 
 def _starts(old: Twin, fitted: ModelFit, forward: ForwardModel) -> tuple[tuple[InitialCondition, ...], Boundary]:
-    if not isinstance(forward, Simulation):
+    if not isinstance(forward, FreeBodyModel):
         return tuple(with_start_values(start, fitted.values) for start in old.initial_conditions), old.boundary
-    first, body = forward.observations[0], old.body
+    body = old.body
     starts = []
-    for observation in forward.observations:
-        state, axes = initial_state_of(fitted.values, observation), observation.problem.axes
+    for index, (observation, setup) in enumerate(zip(forward.observations, forward.setups, strict=True)):
+        state, axes = forward.initial_state(fitted.values, index), setup.body.axes
         starts.append(
             InitialCondition(
                 observation.name,
                 body.name,
-                observation.problem.scene.fps,
+                setup.body.scene.fps,
                 axes.vectors_to_world(state.velocity.double().numpy()),
                 axes.vectors_to_world(state.omega.double().numpy()),
             )
         )
-    ground: Ground | None = initial_state_of(fitted.values, first).ground(first.problem.scene.ground)
+    ground: Ground | None = forward.initial_state(fitted.values, 0).ground(forward.setups[0].body.scene.ground)
     return tuple(starts), replace(old.boundary, ground=ground, contact=fitted.model.contact)
 
 

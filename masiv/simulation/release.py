@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from masiv.errors import InputError
-from masiv.models.marker_body import SimulatedBody, placed_body, plan
-from masiv.mpm.rollout import rollout
+from masiv.models.marked_body import MarkedBody, placed_body
 from masiv.simulation.rollout import Rollout
 from masiv.simulation.twin_effects import effect_members
 from masiv.twin import Twin
@@ -18,22 +17,21 @@ def simulate_release(twin: Twin, *, frames: int, fps: float) -> Rollout:
     """``frames`` frames at k / fps [s] after the release of the only body of ``twin``. Raises InputError,
     NonFiniteError."""
     body = released_body(twin)
-    release = twin.initial_conditions[0].release
-    assert release is not None
     if frames < 2:
         raise InputError(f"--frames {frames}: give at least 2")
     times = np.arange(frames) / fps
-    planned = plan(body, twin.law, times, twin.simulator, speed=release.max_speed)
-    effects = body.effects(effect_members(twin, twin.body), duration=float(times[-1]), frame_time=1 / fps)
-    outputs = sorted(set(planned.outputs))
-    state = body.released(planned.simulator.dtype)
-    positions = rollout(planned.simulator, twin.law, state, planned.steps, outputs, effects)
-    positions = positions[[outputs.index(step) for step in planned.outputs]]
-    world = body.frame.points_to_world(positions.double().numpy())
-    return Rollout(world.astype(np.float32), times, body.markers_to_world(positions), tuple(release.markers))
+    effects = body.effects(effect_members(twin, twin.body), body.context(float(times[-1]), 1 / fps))
+    _, positions = body.run(twin.law, times, effects)
+    world = body.axes.points_to_world(positions.double().numpy())
+    return Rollout(
+        world.astype(np.float32),
+        times,
+        body.markers_to_world(positions),
+        tuple(twin.initial_conditions[0].release.markers),
+    )
 
 
-def released_body(twin: Twin) -> SimulatedBody:
+def released_body(twin: Twin) -> MarkedBody:
     """The only body of ``twin`` at its place in the first observation. Raises InputError if that is not a release."""
     body, start = twin.body, twin.initial_conditions[0]
     if body.particles is None or body.particle_spacing is None or start.placement is None or start.release is None:
@@ -55,4 +53,5 @@ def released_body(twin: Twin) -> SimulatedBody:
         gravity=twin.gravity,
         ground=twin.ground,
         contact=twin.contact,
+        speed=start.release.max_speed,
     )

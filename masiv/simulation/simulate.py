@@ -39,8 +39,8 @@ def simulate(
     force: acts for a while. without: names of effects that are left out. condition: of the observations whose start and
     effects are simulated (None: the first). substeps: in a frame (None: as many as the speed asks for).
 
-    A body that deforms consists of its particles, subdivided (``simulator.split``) if it flies freely; of several
-    observations of one body the first is simulated. Raises InputError for a value that is not finite, for an effect or
+    Particles of a body that flies freely are subdivided (``simulator.subparticles``). Of several observations of one
+    body the first is simulated. Raises InputError for a value that is not finite, for an effect or
     a condition that the twin does not have, for a force that starts after the last frame and for what this kind of body
     cannot have; NonFiniteError if the motion diverges.
     """

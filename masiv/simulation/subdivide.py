@@ -37,11 +37,11 @@ def merge_subparticles(positions: np.ndarray, count: int) -> np.ndarray:
 
 
 def subdivide_twin(twin: Twin) -> Twin:
-    """``twin`` with each particle of its only body in ``simulator.split`` parts, on the grid that it had."""
+    """``twin`` with each particle of its only body in ``simulator.subparticles`` parts, on the grid that it had."""
     config, count = twin.simulator, len(twin.positions)
     spacing = (twin.volume / count) ** (1 / 3)
     simulator = config.model_copy(
-        update={"particles_per_cell": config.split * config.particles_per_cell, "split": 1},
+        update={"particles_per_cell": config.subparticles * config.particles_per_cell, "subparticles": 1},
     )
-    positions = subdivide_particles(twin.positions, spacing, config.split)
+    positions = subdivide_particles(twin.positions, spacing, config.subparticles)
     return replace(twin.with_body(particles=positions), simulator=simulator)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -56,26 +55,6 @@ def gaps(run: Run) -> dict[str, Any]:
         "longest_frames": longest,
         "longest_s": longest / run.rate,
         "by_marker": dict(zip(run.markers, shares.tolist(), strict=True)),
-    }
-
-
-def identity(tracks: Tracks) -> dict[str, Any]:
-    """What tells two scenes of tracks apart: bodies, runs and a digest of what was measured."""
-    digest = hashlib.sha256()
-    for run in tracks.runs:
-        digest.update(np.round(run.times, 9).tobytes())
-        digest.update(np.round(run.positions, 9).tobytes())
-    return {
-        "layout": "tracks",
-        "bodies": list(tracks.bodies),
-        "runs": [
-            f"{run.name}: {run.purpose}, {len(run.times)} frames"
-            + (f" from {run.ignore_after_release:g} s" if run.ignore_after_release else "")
-            for run in tracks.runs
-        ],
-        "up": tracks.up.tolist(),
-        "gravity_m_s2": tracks.gravity.tolist(),
-        "positions_sha256": digest.hexdigest()[:16],
     }
 
 

@@ -62,10 +62,15 @@ def _of_video(data: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "gravity": np.array(data["gravity"]["value"]),
         "up": np.array(data["up"]),
         "initial_conditions": (start,),
-        "simulator": SimulatorConfig(**data["simulator"]),
+        "simulator": _simulator(data["simulator"]),
         "effects": _effects(data["effects"], path, (body,), (start,)),
         "fit": data["fit"],
     }
+
+
+def _simulator(data: Mapping[str, Any]) -> SimulatorConfig:
+    renamed = {{"split": "subparticles"}.get(key, key): value for key, value in data.items()}
+    return SimulatorConfig.model_validate(renamed)
 
 
 def _of_tracks(data: Mapping[str, Any], path: Path, scene: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ horizon, then chord steps with all particles. Derivatives are finite differences
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -18,15 +18,16 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import NonFiniteError
 from masiv.identify.classical.residuals import JointResidual
 from masiv.identify.classical.search import search_family
+from masiv.identify.losses.geometry import mean_distance
 from masiv.identify.losses.objective import Objective
-from masiv.inference.least_squares import Estimate, clipped_step, covariance, gauss_newton
+from masiv.inference.least_squares import Estimate, clipped_step, covariance, gauss_newton, with_start_values
 from masiv.inference.noise_model import effective_samples
 from masiv.inference.robust import NORMAL_MAD, soft_l1_sum, soft_l1_weight
 from masiv.materials.classical import ClassicalLaw
-from masiv.models.families import FAMILIES, Family, law_of, mean_distance
+from masiv.models.families import FAMILIES, Family, law_of
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.models.parameters import Parameter
-from masiv.models.problem import Problem
 from masiv.progress import Progress
 
 MIN_COST_DECREASE = 1e-3
@@ -143,7 +144,7 @@ def _gauss_newton(
         progress(label, min(evaluations, budget), budget, f"{1e3 * mean_distance(paths):.1f} mm")
         return vector
 
-    parameters = _parameters(objective.problem, family, fit)
+    parameters = _parameters(objective, family, fit)
     # Residuals of pixels are bounded, and most are 0: they need no robust scale, and their median is none.
     estimate = gauss_newton(
         residual, parameters, max_evaluations=budget, robust=not with_images, tolerance=MIN_COST_DECREASE
@@ -178,7 +179,7 @@ def fit_all_particles(
         return FamilyFit(**saved)
     label, total = f"identify: {fit.kind} fit, {ALL_PARTICLES_KEY}", CHORD_STEPS + 2
     family = FAMILIES[fit.kind].scaled(coarse.problem.scene.density)
-    parameters = _parameters(coarse.problem, family, fit)
+    parameters = _parameters(coarse, family, fit)
     progress(label, 0, total)
     on_few = JointResidual(coarse, family, fit.contact, coarse.problem.frames, with_images=with_images)
     linear = gauss_newton(lambda values: on_few(values)[1], parameters, max_evaluations=1, robust=not with_images)
@@ -205,7 +206,7 @@ def fit_all_particles(
 
 def _chord_steps(
     joint: JointResidual,
-    parameters: list[Parameter],
+    parameters: Sequence[Parameter],
     values: dict[str, float],
     jacobian: np.ndarray,
     robust_scale: float,
@@ -238,16 +239,16 @@ def _chord_steps(
     return values, paths, residual
 
 
-def _parameters(problem: Problem, family: Family, fit: FamilyFit) -> list[Parameter]:
+def _parameters(objective: Objective, family: Family, fit: FamilyFit) -> tuple[Parameter, ...]:
     """The parameters of law and initial state, from the values of ``fit``."""
-    both = [*family.parameters, *initial_state_parameters(fit.initial_state, problem.ground_range)]
-    return [replace(p, start=float(np.clip(fit.values[p.name], p.lower, p.upper))) for p in both]
+    both = [*family.parameters, *initial_state_parameters(fit.initial_state, objective.ground_range)]
+    return with_start_values(both, fit.values)
 
 
-def _updated(problem: Problem, fit: FamilyFit, estimate: Estimate, stage: int) -> FamilyFit:
+def _updated(problem: FilmedBody, fit: FamilyFit, estimate: Estimate, stage: int) -> FamilyFit:
     """``fit`` with the values and errors of ``estimate``, whose residual is of paths [m]."""
     residual = estimate.residual.reshape(-1, problem.count, 3)
-    samples = effective_samples(residual, problem.start.double().numpy())
+    samples = effective_samples(residual, problem.particles.double().numpy())
     return replace(
         fit,
         values=estimate.values,

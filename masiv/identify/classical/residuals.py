@@ -9,7 +9,31 @@ import torch
 
 from masiv.identify.losses.images import pictures_of_each_frame
 from masiv.identify.losses.objective import VIEWS_COMPARED, Objective
-from masiv.models.families import Family, Rollouts
+from masiv.models.deformable import HeldSubsteps, failures_as_divergence
+from masiv.models.families import Family, law_of
+from masiv.models.filmed_body import FilmedBody
+from masiv.models.initial_state import InitialState
+
+
+class PathResidual:
+    """Paths, simulated less observed, over the first ``frames`` frames: (K, N, 3) [m] as a function of the values of a
+    law and an initial state. The substep is that of the first law, see ``HeldSubsteps``."""
+
+    def __init__(self, problem: FilmedBody, family: Family, contact: str, frames: int) -> None:
+        self.problem = problem
+        self.family = family
+        self.contact = contact
+        self.frames = frames
+        self.held = HeldSubsteps()
+
+    @torch.no_grad()
+    def field(self, values: dict[str, float]) -> np.ndarray:
+        """Raises NonFiniteError if the rollout diverges, spreads without bound or is too stiff to be simulated."""
+        law, start = law_of(self.family, values), InitialState.of_values(values)
+        with failures_as_divergence():
+            steps = self.problem.held_substeps(law, self.held, self.family.kind)
+            positions = self.problem.run(law, start, self.contact, self.frames, steps=steps)
+        return (positions - self.problem.targets[: len(positions)]).double().numpy()
 
 
 class JointResidual:
@@ -28,7 +52,7 @@ class JointResidual:
     ) -> None:  # fmt: skip
         problem = objective.problem
         self.objective = objective
-        self.rollouts = Rollouts(problem, family, contact, frames)
+        self.rollouts = PathResidual(problem, family, contact, frames)
         self.frames = frames
         self.with_images = with_images
         self.chosen = np.arange(problem.count) if chosen is None else chosen
@@ -40,7 +64,7 @@ class JointResidual:
         return vector[: self.path_rows] / self.per_metre
 
     def __call__(self, values: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-        """Paths (K, N, 3) [m] and vector (M,). Raises NonFiniteError as ``Rollouts.field``."""
+        """Paths (K, N, 3) [m] and vector (M,). Raises NonFiniteError as ``PathResidual.field``."""
         paths = self.rollouts.field(values)
         parts = [self.per_metre * paths[:, self.chosen].ravel()]
         if self.with_images:

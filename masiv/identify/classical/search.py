@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from masiv.errors import MasivError, NonFiniteError
+from masiv.identify.classical.residuals import PathResidual
+from masiv.identify.losses.geometry import mean_distance
 from masiv.identify.losses.objective import Objective
-from masiv.models.families import Family, Rollouts, mean_distance
+from masiv.models.families import Family
 from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.progress import Progress
 
@@ -50,7 +52,7 @@ def search_family(
     contacts = ["sticky", "release"] if objective.config.contact == "auto" else [objective.config.contact]
     if problem.scene.ground is None:
         contacts = ["none"]
-    start = {p.name: p.start for p in initial_state_parameters(initial_state, problem.ground_range)}
+    start = {p.name: p.start for p in initial_state_parameters(initial_state, objective.ground_range)}
     starts = [{**candidate, **start} for candidate in family.candidates()]
     total = len(starts) + (len(contacts) - 1) * min(CANDIDATES_WITH_ALL_CONTACTS, len(starts))
     tried: list[_Candidate] = []
@@ -80,7 +82,7 @@ def _rollout_cost(
     """What a start is compared by, and its mean distance to the paths [m]; both infinite if it diverges."""
     problem = objective.problem
     try:
-        residual = Rollouts(problem, family, contact, problem.frames).field(values)
+        residual = PathResidual(problem, family, contact, problem.frames).field(values)
         error_m = mean_distance(residual)
         if not with_images:
             return error_m, error_m

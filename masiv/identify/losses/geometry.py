@@ -27,6 +27,11 @@ def trajectory_error(positions: torch.Tensor, targets: torch.Tensor) -> torch.Te
     return (positions - targets).norm(dim=2).mean()
 
 
+def mean_distance(residual: np.ndarray) -> float:
+    """Mean distance [m] of a residual (K, N, 3) [m]."""
+    return float(np.linalg.norm(residual, axis=2).mean())
+
+
 def chamfer_error(positions: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     """Chamfer distance () [m]: root mean square distance to the nearest point of the other set.
 

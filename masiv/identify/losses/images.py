@@ -19,7 +19,7 @@ from masiv.identify.losses.picture_window import (
     render_particles,
     to_world,
 )
-from masiv.models.problem import Problem
+from masiv.models.filmed_body import FilmedBody
 from masiv.splat.rasteriser import Rendering
 
 SPLAT_SIGMA_RANGE = 0.1, 1.0
@@ -32,7 +32,7 @@ class ImageTerms:
     with_colors: whether colors are compared. Without them, and without pictures, the color error is 0.
     """
 
-    def __init__(self, problem: Problem, *, with_colors: bool) -> None:
+    def __init__(self, problem: FilmedBody, *, with_colors: bool) -> None:
         self.problem = problem
         self.with_colors = with_colors
 
@@ -45,7 +45,7 @@ class ImageTerms:
         silhouettes learns to shrink the body.
         """
         spacing = particle_spacing(self.problem)
-        points, nothing = to_world(self.problem, self.problem.start), torch.zeros(self.problem.count, 3)
+        points, nothing = to_world(self.problem, self.problem.particles), torch.zeros(self.problem.count, 3)
 
         @functools.lru_cache
         @torch.no_grad()
@@ -75,7 +75,7 @@ class ImageTerms:
         """Mean silhouette error () and mean color error () over ``pictures`` (frame, view).
 
         Silhouettes: sum of |alpha - mask| over the area of the mask. Colors: ``color_correlation_loss``.
-        positions (K, N, 3) [m, simulation frame] as ``Problem.run`` returns them.
+        positions (K, N, 3) [m, simulation frame] as ``FilmedBody.run`` returns them.
         """
         parts = [(d.abs().sum() / area, color) for d, area, color in self._compared(positions, pictures)]
         silhouettes, colors = zip(*parts, strict=True)

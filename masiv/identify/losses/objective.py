@@ -16,8 +16,8 @@ from masiv.identify.config import IdentifyConfig
 from masiv.identify.losses.geometry import chamfer_error, surface_points, trajectory_error
 from masiv.identify.losses.images import ImageTerms, pictures_of_each_frame
 from masiv.materials.law import Law
+from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
-from masiv.models.problem import Problem
 
 VIEWS_COMPARED = 3
 """Views of each frame in which finished fits are compared."""
@@ -26,37 +26,42 @@ VIEWS_COMPARED = 3
 class Objective:
     """The objective of one recording: rollouts of ``problem`` against its observed motion.
 
-    config: weights and the kind of geometry loss; that of ``problem`` if None. surface: indices (S,) of the particles
+    config: weights and the kind of geometry loss. surface: indices (S,) of the particles
     on the surface if the geometry loss compares surfaces. images: shared with other objectives of the same problem.
     """
 
     def __init__(
         self,
-        problem: Problem,
-        config: IdentifyConfig | None = None,
+        problem: FilmedBody,
+        config: IdentifyConfig,
         *,
         surface: torch.Tensor | None = None,
         images: ImageTerms | None = None,
     ) -> None:
         self.problem = problem
-        self.config = config or problem.config
+        self.config = config
         self.surface = surface
         with_colors = max(self.config.color_weight, self.config.finetune_color_weight) > 0
         self.images = images or ImageTerms(problem, with_colors=with_colors)
 
     @classmethod
-    def of(cls, problem: Problem, trajectory: Trajectory) -> Objective:
-        """The objective that ``problem.config`` asks for. trajectory: that of ``problem``."""
-        if problem.config.geometry_loss != "surface":
-            return cls(problem)
+    def of(cls, problem: FilmedBody, trajectory: Trajectory, config: IdentifyConfig) -> Objective:
+        """The objective that ``config`` asks for. trajectory: that of ``problem``."""
+        if config.geometry_loss != "surface":
+            return cls(problem, config)
         on_surface = surface_points(trajectory.positions[0])[problem.chosen]
-        return cls(problem, surface=torch.from_numpy(np.flatnonzero(on_surface)))
+        return cls(problem, config, surface=torch.from_numpy(np.flatnonzero(on_surface)))
 
     def with_surface_loss(self, iterations: int) -> Objective:
         """The objective of the surface finetune: surfaces in place of paths, more weight on the pictures."""
-        surface = torch.from_numpy(np.flatnonzero(surface_points(self.problem.start.numpy())))
+        surface = torch.from_numpy(np.flatnonzero(surface_points(self.problem.particles.numpy())))
         config = self.config.with_surface_loss(iterations)
         return Objective(self.problem, config, surface=surface, images=self.images)
+
+    @property
+    def ground_range(self) -> float:
+        """Greatest offset [m] of the effective ground, 0 if there is no ground."""
+        return 0.0 if self.problem.scene.ground is None else self.config.ground_range
 
     @property
     def compares_images(self) -> bool:

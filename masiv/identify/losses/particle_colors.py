@@ -19,7 +19,7 @@ from masiv.identify.losses.picture_window import (
     render_particles,
     to_world,
 )
-from masiv.models.problem import Problem
+from masiv.models.filmed_body import FilmedBody
 
 SIRT_SWEEPS = 12
 COLOR_SPLAT_SIGMA = 0.5
@@ -49,14 +49,14 @@ class ParticleColors:
 
 
 @torch.enable_grad()
-def estimate_particle_colors(problem: Problem) -> ParticleColors:
+def estimate_particle_colors(problem: FilmedBody) -> ParticleColors:
     """The colors of the particles of ``problem`` from all pictures of frame 0.
 
     A picture is linear in the colors. They are solved for by simultaneous back-projection (SIRT, Gilbert 1972): in each
     sweep a particle's color changes by the mean residual of the pixels to which it contributes.
     """
     count, sigma = problem.count, COLOR_SPLAT_SIGMA * particle_spacing(problem)
-    points = to_world(problem, problem.start)
+    points = to_world(problem, problem.particles)
     windows = [picture_window(problem.scene, view, 0) for view in problem.scene.views]
     colors = torch.full((count, 3), 0.5, requires_grad=True)
     weight = torch.zeros(count)

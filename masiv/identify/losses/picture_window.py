@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from masiv.models.problem import Problem
+from masiv.models.filmed_body import FilmedBody
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 from masiv.splat.rasteriser import Rendering, render
@@ -57,13 +57,13 @@ def render_particles(
     return render(window.camera, points, sigmas, opacities, channels, torch.zeros(3))
 
 
-def to_world(problem: Problem, points: torch.Tensor) -> torch.Tensor:
+def to_world(problem: FilmedBody, points: torch.Tensor) -> torch.Tensor:
     """Points (N, 3) [m, world] from points (N, 3) [m, simulation frame]."""
     rotation = torch.as_tensor(problem.axes.rotation, dtype=torch.float32)
     translation = torch.as_tensor(problem.axes.translation, dtype=torch.float32)
     return (points - translation) @ rotation
 
 
-def particle_spacing(problem: Problem) -> float:
+def particle_spacing(problem: FilmedBody) -> float:
     """Side [m] of the cube of volume that a particle stands for."""
     return (problem.volume / problem.count) ** (1 / 3)

@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from masiv.refine.answer import answer
-from masiv.report.page import Page, Share
+from masiv.report.page import Page
+from masiv.report.sections.refinement import refinement_section
+from masiv.report.sections.twin import twin_section
 from masiv.tracks.tracks import Tracks
 from masiv.twin import Twin
 
 COLUMNS = 2
 
 
-def write_page(
+def write_report(
     path: Path,
     tracks: Tracks,
     twin: Twin,
@@ -33,59 +34,15 @@ def write_page(
     page.heading("Numbers")
     names = [n for n in runs[0] if n not in ("run", "use")] if runs else []
     page.table(["run", "use", *names], [[r["run"], r["use"], *(r[n] for n in names)] for r in runs])
-    page.heading("The twin")
-    rows: list[list[Any]] = [["law", "rigid" if twin.rigid else twin.law.kind, "", None]]
-    if not twin.rigid:
-        described = twin.law.description()["parameters"]
-        rows += [[n.replace("_", " "), row["value"], row["unit"], row.get("stderr")] for n, row in described.items()]
-    for effect in twin.effects:
-        where = ", ".join(effect.bodies) or "all"
-        rows += [[f"{effect.name.replace('_', ' ')} ({where}): {n}", v, u, e] for n, v, u, e in effect.rows()]
-        if effect.place is not None:
-            rows.append([f"{effect.name.replace('_', ' ')}: place in the body", list(effect.place), "m", None])
-    page.table(["quantity", "value", "unit", "standard error"], rows)
+    twin_section(page, twin)
     for document in refined:
-        _section(page, document)
+        refinement_section(page, document)
     page.heading("Motion")
-    page.picture(pictures(curves), "observed and simulated motion of each run")
+    page.picture(_paths_of_markers(curves), "observed and simulated motion of each run")
     page.write(path)
 
 
-def _section(page: Page, document: Mapping[str, Any]) -> None:
-    title = "What does the model lack?"
-    page.heading(f"{title} Condition {document['condition']}" if document.get("condition") else title)
-    page.note(f"Verdict: {answer(document)}.")
-    page.table(
-        ["effect", "explained", "strength", "unit", "looks like"],
-        [
-            [c["effect"], Share(c["explained"]), c["theta"], c["unit"], ", ".join(c["confusable_with"])]
-            for c in document["candidates"]
-        ],
-    )
-    page.subheading("Fitted through the simulation")
-    page.table(
-        ["effect", "fitted runs [mm]", "held-out runs [mm]", "outcome"],
-        [
-            [
-                t["effect"], t["fit_rmse_mm"], t["held_out_rmse_mm"],
-                "accepted" if t["accepted"] else "; ".join(t["objections"]) or "another was better",
-            ]
-            for r in document["rounds"]
-            for t in r["refits"]
-        ],
-    )  # fmt: skip
-    if document.get("bodies"):
-        page.subheading("By body, on held-out runs")
-        page.table(
-            ["body", "verdict", "effects", "before [mm]", "after [mm]"],
-            [
-                [n, b["verdict"], ", ".join(b["effects"]), b["held_out_mm"]["before"], b["held_out_mm"]["after"]]
-                for n, b in document["bodies"].items()
-            ],
-        )
-
-
-def pictures(curves: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
+def _paths_of_markers(curves: Mapping[str, Mapping[str, np.ndarray]]) -> bytes:
     """A panel a run: the axis that moves most of the point that moves most, and what is left of it."""
     import matplotlib
 

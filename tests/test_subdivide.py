@@ -55,7 +55,7 @@ def test_parts_are_the_particle(parts, count, spacing):
 
 
 def test_the_grid_stays():
-    whole = bar(0.0, split=8)
+    whole = bar(0.0, subparticles=8)
     fine = subdivide_twin(whole)
     cells = [grid_spacing(t.volume, len(t.positions), t.simulator) for t in (whole, fine)]
     assert cells[0] == pytest.approx(cells[1], rel=1e-12)
@@ -71,7 +71,7 @@ def test_what_are_not_parts():
 def test_a_bar_that_cannot_break_does_not():
     """A neo-Hookean bar that spins at 12 rad/s is drawn to 1.4 times its length and springs back. In whole particles it
     tears, at gaps of little more than a cell; in parts it holds."""
-    whole, parts = (simulate(bar(12.0, split=n), frames=FRAMES).positions for n in (1, 4))
+    whole, parts = (simulate(bar(12.0, subparticles=n), frames=FRAMES).positions for n in (1, 4))
     cell = 3.0 ** (1 / 3) * SPACING
     assert np.ptp(parts[3], axis=0)[:2].max() > 1.2 * np.ptp(parts[0], axis=0).max()  # it is drawn
     assert max(widest_gap(points, cell) for points in parts) < 0.7

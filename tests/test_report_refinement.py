@@ -9,7 +9,8 @@ import pytest
 
 from masiv.errors import InputError
 from masiv.report import plots
-from masiv.report.refined import refine_section
+from masiv.report.page import Page
+from masiv.report.sections.refinement import read_refined, refinement_section
 
 ERRORS = {
     "fit": {"frames": [0, 11], "trajectory_rmse_mm": 10.7, "chamfer_1e3mm2": 0.31},
@@ -70,9 +71,17 @@ def write(run, found, arrays):
     np.savez(run / "refine.npz", **arrays)
 
 
+def section_of(run, up=None):
+    page, refined = Page(""), read_refined(run)
+    if refined is None:
+        return None
+    refinement_section(page, *refined, up)
+    return "".join(page.parts)
+
+
 def test_numbers_and_pictures_of_an_accepted_effect(tmp_path):
     write(tmp_path, document(), fields())
-    section = refine_section(tmp_path, np.array([0.0, 1.0, 0.0]))
+    section = section_of(tmp_path, np.array([0.0, 1.0, 0.0]))
     assert section.count("data:image/png;base64,") == 2
     shown = ["effect added: linear drag", "0.7234", "0.0213", "81 %", "10.7 → 4.2", "40.2 → 13.1", "quadratic drag"]
     markup = ["held out &lt;gets&gt; worse", "slows &amp; slows"]  # text is never markup
@@ -85,13 +94,13 @@ def test_nothing_found(tmp_path):
     found = document(accepted=[], candidates=[], rounds=[], next_experiment=None, before=alone, after=alone,
                      verdict="nothing missing", grid_change={"before": None, "after": None})  # fmt: skip
     write(tmp_path, found, fields(instants=12, fitted=12))
-    section = refine_section(tmp_path)
+    section = section_of(tmp_path)
     assert "nothing missing" in section
     assert [text for text in ("What was added", "held out", "Refits", "finer grids") if text in section] == []
 
 
-def test_a_stop_gap_is_called_one(tmp_path):
-    gap = {
+def test_a_discrepancy_force_is_no_cause(tmp_path):
+    force = {
         "effect": "smooth_force",
         "theta": {},
         "stderr": {},
@@ -99,22 +108,22 @@ def test_a_stop_gap_is_called_one(tmp_path):
         "fit_rmse_mm": 3.25,
         "held_out_rmse_mm": 9.75,
     }
-    write(tmp_path, document(accepted=[], verdict="unexplained residual", stop_gap=gap), fields())
-    section = refine_section(tmp_path)
+    write(tmp_path, document(accepted=[], verdict="unexplained residual", discrepancy_force=force), fields())
+    section = section_of(tmp_path)
     assert [
-        t for t in ("unexplained residual", "not an explanation", "3.25", "9.75 mm held out") if t not in section
+        t for t in ("unexplained residual", "without a known cause", "3.25", "9.75 mm held out") if t not in section
     ] == []
 
 
 def test_absent_and_unreadable(tmp_path):
-    assert refine_section(tmp_path) is None
+    assert section_of(tmp_path) is None
     write(tmp_path, document(), fields())
     (tmp_path / "refine.npz").write_bytes(b"PK broken")
     with pytest.raises(InputError, match="run masiv refine again"):
-        refine_section(tmp_path)
-    write(tmp_path, document(schema=2), fields())
+        section_of(tmp_path)
+    write(tmp_path, document(schema=1), fields())
     with pytest.raises(InputError, match="another version"):
-        refine_section(tmp_path)
+        section_of(tmp_path)
 
 
 def test_fields_of_one_instant_and_of_no_residual():

@@ -27,7 +27,7 @@ METRICS = {
 
 
 def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-    """refine.json and refine.npz of the run folder, None where it lacks one. InputError: unreadable."""
+    """refine.json and refine.npz of the run folder, None if it lacks one. Raises InputError if they cannot be read."""
     if not (run / REFINED).is_file() or not (run / FIELDS).is_file():
         return None
     try:
@@ -42,26 +42,39 @@ def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | No
     return document, fields
 
 
-def refine_section(run: Path, up: np.ndarray | None = None) -> str | None:
-    """HTML of the section on what ``masiv refine`` left in ``run``, None where it was not run.
-
-    up (3,): upwards in the world, for the views. Raises InputError where the files cannot be read.
-    """
-    found = read_refined(run)
-    if found is None:
-        return None
-    document, fields = found
-    page = Page("")
-    page.heading("Closing the loop: what does the model lack?")
+def refinement_section(
+    page: Page,
+    document: Mapping[str, Any],
+    fields: Mapping[str, np.ndarray] | None = None,
+    up: np.ndarray | None = None,
+) -> None:
+    """What ``document`` (refine.json) says. fields: arrays of refine.npz, drawn in time and space if given. up (3,):
+    upwards in the world, for the views."""
+    title = "Closing the loop: what does the model lack?"
+    page.heading(f"{title} Condition {document['condition']}" if document.get("condition") else title)
     page.note(_verdict(document))
-    _figures(page, document, fields, up)
+    if fields is not None:
+        _figures(page, document, fields, up)
     _causes(page, document["candidates"])
     _refits(page, document["rounds"])
     _before_after(page, document["before"], document["after"])
     _accepted(page, document["accepted"])
+    _bodies(page, document.get("bodies") or {})
     _unexplained(page, document["unexplained"], document["discrepancy_force"])
     _next_experiment(page, document.get("next_experiment"))
-    return "".join(page.parts)
+
+
+def _bodies(page: Page, bodies: Mapping[str, Any]) -> None:
+    if not bodies:
+        return
+    page.subheading("By body, on held-out observations")
+    page.table(
+        ["body", "verdict", "effects", "before [mm]", "after [mm]"],
+        [
+            [name, b["verdict"], ", ".join(b["effects"]), b["held_out_mm"]["before"], b["held_out_mm"]["after"]]
+            for name, b in bodies.items()
+        ],
+    )
 
 
 def _verdict(document: Mapping[str, Any]) -> str:
@@ -71,7 +84,7 @@ def _verdict(document: Mapping[str, Any]) -> str:
         law += f", then {words(laws['after'])}"
     errors = [
         f"{label} {_mm(document['before'], split)} → {_mm(document['after'], split)} mm"
-        for split, label in (("fit", "fitted frames"), ("held_out", "held-out frames"))
+        for split, label in (("fit", "fitted"), ("held_out", "held out"))
         if document["before"].get(split)
     ]
     return (
@@ -82,7 +95,7 @@ def _verdict(document: Mapping[str, Any]) -> str:
 
 
 def _grid(document: Mapping[str, Any]) -> str:
-    """How much of what finer grids change is in the motion that the residual is of; nothing where none was fitted."""
+    """How much of what finer grids change is in the motion that the residual is of; nothing if none was fitted."""
     share = document["grid_change"]["after"]
     if share is None:
         return ""
@@ -102,8 +115,8 @@ def _figures(page: Page, document: Mapping[str, Any], fields: Mapping[str, np.nd
         plots.residual_in_time(shown, times, int(fields["fit_count"]), document["noise_floor_mm"]), "residual in time"
     )
     page.note(
-        "What the added effect explains is the gap between the curves, also on held-out frames, which no fit saw; what "
-        "stays above the dashed line is not noise."
+        "The gap between the curves is what the added effect explains. No fit saw the held-out frames, which take part "
+        "in the choice of effects. What stays above the dashed line is not noise."
         if added
         else "A curve near the dashed line leaves nothing to explain; one that grows away from it is missing physics."
     )
@@ -123,7 +136,7 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
         ["effect", "explains alone", "strength", "unit", "standard error", "looks like", "what it does in a video"],
         [
             [
-                words(c["effect"]),
+                _name(c),
                 Share(c["explained"]),
                 _number(c["theta"]),
                 _unit(c["unit"]),
@@ -135,9 +148,9 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
         ],
     )
     page.note(
-        "Share of the residual that one effect explains, once launch, stiffness and ground have absorbed what they "
-        "can (score test, first order: a shortlist, the refits decide). Looks like: what this motion hardly tells it "
-        "from."
+        "Share of the residual that one effect explains, after initial velocity, stiffness and ground have absorbed "
+        "what they can (score test, first order: a shortlist, the refits decide). Looks like: effects that this motion "
+        "hardly distinguishes from it."
     )
 
 
@@ -148,7 +161,7 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
             values = ", ".join(f"{words(n)} {number(_number(q['value']))}" for n, q in refit["parameters"].items())
             result = "accepted" if refit["accepted"] else "; ".join(refit["objections"]) or "another was better"
             rows.append([
-                turn, ", ".join(map(words, [*done["base"]["effects"], refit["effect"]])), words(refit["law"]),
+                turn, ", ".join(map(words, [*done["base"]["effects"], _name(refit)])), words(refit["law"]),
                 _number(refit["fit_rmse_mm"]), _number(refit["held_out_rmse_mm"]),
                 _number(refit["information_gain"]), values, result,
             ])  # fmt: skip
@@ -156,10 +169,19 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
         return
     page.subheading("Refits that competed")
     page.table(
-        ["round", "effects", "law", "fitted [mm]", "held out [mm]", "BIC falls by", "values", "accepted, or why not"],
+        [
+            "round",
+            "effects",
+            "law",
+            "fitted [mm]",
+            "held out [mm]",
+            "BIC falls by",
+            "values",
+            "accepted, or objections",
+        ],
         rows,
     )
-    page.note("Each was fitted through the rollout together with the law's parameters and the launch.")
+    page.note("Each was fitted through the rollout together with the law's parameters and the initial state.")
 
 
 def _before_after(page: Page, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
@@ -187,10 +209,10 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
         return
     page.subheading("What was added")
     page.table(
-        ["effect", "parameter", "value", "standard error", "unit", "may as well be", "looks like"],
+        ["effect", "parameter", "value", "standard error", "unit", "indistinguishable from", "looks like"],
         [
             [
-                words(a["effect"]),
+                _name(a),
                 words(n),
                 _number(value),
                 _number(a["stderr"].get(n)),
@@ -239,6 +261,12 @@ def _next_experiment(page: Page, proposal: Mapping[str, Any] | None) -> None:
         f"{number(velocity['value'])} {velocity['unit']} and a spin of {number(spin['value'])} {spin['unit']} they "
         f"would be {number(_number(proposal['predicted_difference_mm']))} mm apart."
     )
+
+
+def _name(row: Mapping[str, Any]) -> str:
+    """An effect and whom it acts on."""
+    scope = row.get("scope", "all")
+    return words(row["effect"]) if scope == "all" else f"{words(row['effect'])} ({scope})"
 
 
 def _number(value: Any) -> float | None:

@@ -1,8 +1,9 @@
-"""Video: what a copy of the simulation shares, where it starts, and what finer grids change."""
+"""The model of a filmed body: what its copies share, where it starts, what finer grids change."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import copy
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,33 +14,37 @@ from test_workers import small_simulation
 from masiv.errors import MasivError
 from masiv.inference.least_squares import derivative
 from masiv.inference.model_fit import residual_of
+from masiv.models.base import Model
 from masiv.models.families import FAMILIES
-from masiv.models.free_body import Model, Simulation
+from masiv.models.free_body import FreeBodyModel
 
 
+@pytest.mark.usefixtures("taichi")
 def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
-    @dataclass(frozen=True)
-    class Throw:
-        problem: SimpleNamespace
-        fitted: int = 12
-        flight: int = 3
+    (setup,) = small_simulation()[0].setups
+    count = 30
+    observation = replace(
+        setup.observation, times=np.arange(count) / 24, values=np.zeros((count, 1, 3), np.float32),
+        points=np.zeros((1, 3)), residual_std=np.ones(count), samples_per_frame=2, fit_count=22,
+    )  # fmt: skip
 
-        @property
-        def fit_count(self):
-            return (self.fitted - 1) * self.problem.samples
+    def horizons(errors, flight):
+        """Frames that are fitted in the shorter models, for errors (T,) in sizes of the body."""
+        body = copy.copy(setup.body)
+        body.samples = 2
+        model = FreeBodyModel([replace(setup, observation=observation, body=body, flight=flight)])
+        field = np.zeros((count, 1, 3))
+        field[:, 0, 0] = errors * body.size
+        return [shorter.observations[0].fit_frames for shorter in model.curriculum([field])]
 
-    simulation = Simulation([Throw(SimpleNamespace(size=0.5, samples=2))])
-    near = np.full(30, 1e-6)
-    assert simulation.curriculum(SimpleNamespace(squares=[near])) == []
-    away = np.where(np.arange(30) < 12, near, 0.2**2)  # at the end of frame 6, all is well
-    assert [s.observations[0].fitted for s in simulation.curriculum(SimpleNamespace(squares=[away]))] == [9, 10]
-    # A fit that gives up the flight for what comes after it shows at once, which is no sign of when that was.
-    everywhere = np.full(30, 0.2**2)
-    for flight, horizons in ((3, [6, 9]), (6, [9, 10])):
-        simulation = Simulation([replace(simulation.observations[0], flight=flight)])
-        assert [
-            s.observations[0].fitted for s in simulation.curriculum(SimpleNamespace(squares=[everywhere]))
-        ] == horizons
+    near = np.full(count, 2e-3)
+    assert horizons(near, 3) == []
+    away = np.where(np.arange(count) < 12, near, 0.4)  # at the end of frame 6, all is well
+    assert horizons(away, 3) == [8, 9]
+    # A fit that gives up the flight for what comes after it is wrong at once, which is no sign of when that was.
+    everywhere = np.full(count, 0.4)
+    assert horizons(everywhere, 3) == [5, 8]
+    assert horizons(everywhere, 6) == [8, 9]
 
 
 @pytest.mark.usefixtures("taichi")
@@ -54,20 +59,20 @@ def test_first_moments_begin_with_the_throw_of_free_flight():
 
 @pytest.mark.usefixtures("taichi")
 def test_a_law_that_few_particles_can_take_finer_grids_can_take_too():
-    (observation,) = small_simulation()[0].observations
+    (setup,) = small_simulation()[0].setups
 
     def law(modulus):
         return SimpleNamespace(wave_modulus=lambda: modulus)
 
     def possible(modulus):
         try:
-            return observation.problem.least_substeps(law(modulus)) > 0
+            return setup.body.min_substeps(law(modulus)) > 0
         except MasivError:
             return False
 
     stiffest = max(filter(possible, np.geomspace(1e3, 1e8, 200)))
-    needed = [finer.least_substeps(law(stiffest)) for finer in observation.finer]
-    assert max(needed) > observation.problem.simulator.max_substeps_per_frame
+    needed = [finer.min_substeps(law(stiffest)) for finer in setup.finer]
+    assert max(needed) > setup.body.body.config.max_substeps_per_frame
 
 
 @pytest.mark.usefixtures("taichi")
@@ -77,7 +82,8 @@ def test_a_model_has_a_share_of_what_finer_grids_change():
     values = {p.name: p.start for p in simulation.parameters(model)}
     (without,) = simulation.fields(model, values)
     change = np.random.default_rng(0).normal(size=(simulation.observations[0].time_count, *without.shape[1:]))
-    simulation.observations = (replace(simulation.observations[0], grid_changes=(0.9 * change, 1.1 * change)),)
+    corrected = replace(simulation.observations[0], grid_corrections=(0.9 * change, 1.1 * change))
+    simulation = simulation.with_observations([corrected])
     share = simulation.parameters(model)[0]
     assert (share.name, share.start) == ("grid_change@run", 0.0)
     rolled = simulation.rollouts
@@ -97,11 +103,19 @@ def test_a_copy_with_other_observations_leaves_the_simulation_as_it_was():
     values = {p.name: p.start for p in simulation.parameters(model)}
     residual = simulation.residual(model, values)
     (observation,) = simulation.observations
-    copy = simulation.with_observations([replace(observation, residual_std=2 * observation.residual_std)])
+    other = simulation.with_observations([replace(observation, residual_std=2 * observation.residual_std)])
     rolled = simulation.rollouts
-    np.testing.assert_allclose(copy.residual(model, values), 0.5 * residual)
-    assert copy.rollouts == simulation.rollouts == rolled  # the rollout was known
-    copy.residual(model, {**values, "youngs_modulus": 1.1 * values["youngs_modulus"]})
-    assert copy.rollouts == simulation.rollouts == rolled + 1
+    np.testing.assert_allclose(other.residual(model, values), 0.5 * residual)
+    assert other.rollouts == simulation.rollouts == rolled  # the rollout was known
+    other.residual(model, {**values, "youngs_modulus": 1.1 * values["youngs_modulus"]})
+    assert other.rollouts == simulation.rollouts == rolled + 1
     assert simulation.observations == (observation,)
     np.testing.assert_array_equal(simulation.residual(model, values), residual)
+
+
+@pytest.mark.usefixtures("taichi")
+def test_recordings_of_one_name_are_refused():
+    """They would share their initial state."""
+    (setup,) = small_simulation()[0].setups
+    with pytest.raises(ValueError, match="different names"):
+        FreeBodyModel([setup, setup])

@@ -16,11 +16,12 @@ from masiv.report.draw import draw, on_black
 from masiv.report.film import joined
 from masiv.report.follow import Binding
 from masiv.report.history import curves
-from masiv.report.material import material_section, read_material
 from masiv.report.media import write_video
 from masiv.report.numbers import rows
 from masiv.report.page import Page
-from masiv.report.refined import refine_section
+from masiv.report.sections.material import material_section, read_material
+from masiv.report.sections.refinement import read_refined, refinement_section
+from masiv.report.sections.twin import twin_section
 from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
 
@@ -60,17 +61,15 @@ def write_report(
     page.heading("Numbers")
     page.table(*rows(numbers))
     page.note("PSNR and SSIM: object on black. 'to trajectory' is what the fit made small, no ground truth.")
-    page.heading("The twin")
-    page.table(["quantity", "value", "unit"], _twin_rows(twin))
-    _effects_section(page, twin)
+    twin_section(page, twin)
     material = read_material(run.path)
     if material is None:
         page.picture(plots.law_curves(twin.law), "stress of the identified law")
     else:
         material_section(page, material)
-    refined = refine_section(run.path, scene.up)
+    refined = read_refined(run.path)
     if refined is not None:
-        page.parts.append(refined)
+        refinement_section(page, *refined, scene.up)
     page.heading("Motion")
     fit_end = (run.fit_frames - 1) / scene.fps
     motions = {"trajectory": (trajectory.positions, trajectory.times), "twin": (rollout, scene.times)}
@@ -135,51 +134,6 @@ def comparison_video(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, ro
         path = Path(folder) / "comparison.mp4"
         write_video(path, comparison_frames(run, scene, dynamic, rollout, view), scene.fps, repeat=SLOWER)
         return path.read_bytes()
-
-
-def _twin_rows(twin: Twin) -> list[list[Any]]:
-    rows: list[list[Any]] = [
-        ["initial velocity", twin.velocity.tolist(), "m/s"],
-        ["initial spin", twin.omega.tolist(), "rad/s"],
-        ["gravity", twin.gravity.tolist(), "m/s²"],
-        ["volume", float(twin.volume), "m³"],
-        ["density (given, not identified)", float(twin.density), "kg/m³"],
-        ["ground height", None if twin.ground is None else float(twin.ground.height), "m"],
-        ["contact", twin.contact, ""],
-    ]
-    law = twin.law.description()
-    fit = twin.fit if "refined" not in twin.fit else twin.fit["refined"]  # the rest is of the law before
-    for group in ({"law": law.get("kind")}, law.get("parameters", {}), fit):
-        for name, value in group.items():
-            if name == "history":
-                continue
-            quantity, unit = (value["value"], value["unit"]) if isinstance(value, Mapping) else (value, "")
-            rows.append([name.replace("_", " "), quantity, unit])
-    return rows
-
-
-def _effects_section(page: Page, twin: Twin) -> None:
-    """What acts on the twin besides its law, gravity and ground."""
-    from masiv.effects.catalogue import effect_named
-
-    if not twin.effects:
-        return
-    page.table(
-        ["effect", "looks like", "parameter", "value", "unit", "standard error"],
-        [
-            [
-                effect.name.replace("_", " "),
-                effect_named(effect.name).looks_like,
-                name.replace("_", " "),
-                value,
-                unit,
-                stderr,
-            ]
-            for effect in twin.effects
-            for name, value, unit, stderr in effect.rows()
-        ],
-    )
-    page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
 
 
 def _picture_curves(run: RunFolder, numbers: Mapping[str, Any]) -> bytes:

@@ -1,0 +1,205 @@
+"""A measured body in the simulator: particles, clamp, the markers tied to it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from masiv.effects.active import ActiveEffects
+from masiv.errors import InputError
+from masiv.materials.law import Law
+from masiv.models.attachment import Attachment, attach
+from masiv.models.deformable import DeformableBody, checked_instants
+from masiv.models.release import clamp_axes, static_deflection
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.rollout import at_rest
+from masiv.mpm.state import State
+from masiv.scene.scene import Ground
+from masiv.scene.transforms import SimulationFrame
+from masiv.tracks.geometry import fill_geometry
+from masiv.tracks.placement import Placement
+from masiv.tracks.tracks import Clamp, Run, Tracks
+
+TILT_WEIGHT = 1e-3
+"""Of the rotation's trace beside the height of y, so that equal choices of axes are decided."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkedBody(DeformableBody):
+    """A body that is let go from rest, with markers that are tied to its material.
+
+    contact: with the ground; attachment: of ``markers``, the run's markers that move with the material (indices into
+    ``run.markers``). particles: float64.
+    """
+
+    contact: str
+    attachment: Attachment
+    markers: tuple[int, ...]
+
+    @property
+    def clamp_axes(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """See ``masiv.models.release.clamp_axes``."""
+        return clamp_axes(self.gravity, self.normals)
+
+    def released(self, dtype: torch.dtype = torch.float32, deflection: float = 0.0) -> State:
+        """State at the release: at rest. It is stress-free if ``deflection`` [m] is 0, else bent as by its weight."""
+        x = self.particles.double()
+        gradient = torch.eye(3, dtype=x.dtype).expand(len(x), 3, 3)
+        axes = self.clamp_axes
+        if axes is not None and deflection != 0:
+            x, gradient = static_deflection(x, self.heights[0], axes, deflection)
+        still = torch.zeros_like(x, dtype=dtype)
+        state = at_rest(x.to(dtype), still, torch.zeros_like(gradient, dtype=dtype))
+        return replace(state, trial_gradient=gradient.to(dtype).contiguous())
+
+    def markers_to_world(self, positions: torch.Tensor) -> np.ndarray:
+        """Particles (T, N, 3) [m, simulation axes] -> markers (T, len(markers), 3) [m, world]."""
+        return self.axes.points_to_world(self.attachment.apply(positions.detach().double()).numpy())
+
+    def substep(self, law: Law, times: np.ndarray) -> float:
+        """The longest [s] that divides the mean interval of ``times`` (T,) [s] evenly and that ``law`` is stable with.
+        Raises MasivError if an interval needs too many, InputError for times that do not ascend from 0."""
+        interval = float(checked_instants(times)[-1]) / max(len(times) - 1, 1)
+        return interval / self.substeps(law, interval)
+
+    def run(
+        self,
+        law: Law,
+        times: np.ndarray,
+        effects: ActiveEffects | None = None,
+        *,
+        substep: float | None = None,
+        deflection: float = 0.0,
+        dtype: torch.dtype = torch.float32,
+    ) -> tuple[np.ndarray, torch.Tensor]:
+        """Instants (T,) [s since the release], the ends of the substeps nearest to ``times`` (T,) [s]; and positions
+        (T, N, 3) [m, simulation axes] there.
+
+        effects: with the clamp, see ``DeformableBody.effects``; the clamp alone if None. substep [s]: see ``substep``.
+        deflection: see ``released``. Raises NonFiniteError, and as ``substep``.
+        """
+        times = checked_instants(times)
+        duration = float(times[-1])
+        effects = effects or self.effects((), self.context(duration, duration / max(len(times) - 1, 1)))
+        substep = substep or self.substep(law, times)
+        outputs = [round(float(t) / substep) for t in times]
+        state = self.released(dtype, deflection)
+        positions = self.rollout(law, state, outputs, substep=substep, contact=self.contact, effects=effects)
+        return np.array(outputs) * substep, positions
+
+
+def marked_body(
+    tracks: Tracks,
+    run: Run,
+    config: SimulatorConfig,
+    *,
+    particle_spacing: float,
+    contact: str = "sticky",
+    speed: float = 1.0,
+) -> MarkedBody:
+    """The body of ``run`` filled with particles ``particle_spacing`` [m] apart, see ``placed_body``. Raises InputError
+    if the scene does not say what is needed."""
+    body = tracks.bodies[run.body]
+    if body.geometry is None or body.density is None or run.placement is None:
+        raise InputError(f"{tracks.path}: body {body.name} needs a geometry, and a density or a mass, to be simulated")
+    free = body.free_markers(run)
+    if not free:
+        raise InputError(f"run {run.name}: no marker with all three axes moves with the material")
+    return placed_body(
+        fill_geometry(body.geometry, particle_spacing),
+        body.geometry.volume,
+        body.density,
+        config,
+        particle_spacing=particle_spacing,
+        placement=run.placement,
+        clamp=body.clamp,
+        at_rest=run.at_rest[list(free)],
+        markers=free,
+        up=tracks.up,
+        gravity=tracks.gravity,
+        ground=tracks.ground,
+        contact=contact if tracks.ground is not None else "none",
+        speed=speed,
+    )
+
+
+def placed_body(
+    own: np.ndarray,
+    volume: float,
+    density: float,
+    config: SimulatorConfig,
+    *,
+    particle_spacing: float,
+    placement: Placement,
+    clamp: Clamp | None,
+    at_rest: np.ndarray,
+    markers: tuple[int, ...],
+    up: np.ndarray,
+    gravity: np.ndarray,
+    ground: Ground | None,
+    contact: str,
+    speed: float,
+) -> MarkedBody:
+    """Particles ``own`` (N, 3) [m, own axes], ``particle_spacing`` [m] apart, at a place in the world, and markers tied
+    to them that are ``at_rest`` (M, 3) [m, world]. volume [m³]; density [kg/m³]; up (3,) and gravity (3,) [m/s²]:
+    world; speed [m/s]: see ``DeformableBody``.
+
+    The grid holds ``config.particles_per_cell`` of them a cell. Without a ground it runs along the body's own axes, a
+    plane of its nodes in each face of the clamp's first plane, so that neither is blurred.
+    """
+    axes = _along_body(placement.rotation, up) if ground is None else SimulationFrame.from_scene(up, ground)
+    normals, heights = np.zeros((0, 3)), np.zeros(0)
+    if clamp is not None:
+        in_world = clamp.normals @ placement.rotation.T
+        heights = clamp.heights + in_world @ placement.translation
+        normals = axes.vectors_to_simulation(in_world)
+        heights = heights + normals @ axes.translation
+    if ground is None:
+        axes, heights = _on_nodes(axes, placement.to_world(own), normals, heights)
+    particles = axes.points_to_simulation(placement.to_world(own))
+    return MarkedBody(
+        particles=torch.as_tensor(particles),
+        volume=volume,
+        density=density,
+        size=float(np.ptp(particles, axis=0).max()),
+        axes=axes,
+        gravity=axes.vectors_to_simulation(gravity),
+        config=config,
+        speed=speed,
+        normals=torch.as_tensor(normals),
+        heights=torch.as_tensor(heights),
+        max_substeps=256,
+        contact=contact,
+        attachment=attach(particles, axes.points_to_simulation(at_rest), particle_spacing),
+        markers=markers,
+    )
+
+
+def _along_body(rotation: np.ndarray, up: np.ndarray) -> SimulationFrame:
+    """Axes along those of the body, the one nearest to ``up`` as y."""
+    to_own = rotation.T
+    best, nearest = np.eye(3), -math.inf
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            turn = np.diag(signs) @ np.eye(3)[list(order)] @ to_own
+            score = float((turn @ up)[1]) + TILT_WEIGHT * float(np.trace(turn))
+            if np.linalg.det(turn) > 0 and score > nearest:
+                best, nearest = turn, score
+    return SimulationFrame(best, np.zeros(3))
+
+
+def _on_nodes(
+    axes: SimulationFrame, world: np.ndarray, normals: np.ndarray, heights: np.ndarray
+) -> tuple[SimulationFrame, np.ndarray]:
+    """Shift ``axes`` so that nodes lie in the first plane of the clamp, and in the body's middle otherwise."""
+    points = axes.points_to_simulation(world)
+    shift = -0.5 * (points.max(0) + points.min(0))
+    if len(heights):
+        along = int(np.abs(normals[0]).argmax())
+        if abs(normals[0, along]) > 1 - 1e-6:
+            shift[along] = -heights[0] * np.sign(normals[0, along])
+    return SimulationFrame(axes.rotation, axes.translation + shift), heights + normals @ shift

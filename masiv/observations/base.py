@@ -1,0 +1,98 @@
+"""What was observed of a motion, whether it was filmed or tracked by markers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """N points of one recording at T instants, of which the first ``fit_count`` are fitted and the rest is held out.
+
+    name: of the recording, different from those that it is fitted with. times (T,) [s], ascending. points (N, 3) [m]:
+    where the points are at the start, in the axes of ``values``. values (T, N, A) [m]: what was measured in A axes, NaN
+    if it is missing. noise_std [m]: of the measurement. residual_std (T,) [m]: by how much a model that lacks nothing
+    may differ from it. grid_corrections, each (T, N, A) [m]: what each finer grid changes along the motion of a model;
+    empty if that is not known. ``dataclasses.replace`` gives an observation another noise or split.
+
+    Raises ValueError for shapes that do not fit together.
+    """
+
+    name: str
+    times: np.ndarray
+    points: np.ndarray
+    values: np.ndarray
+    fit_count: int
+    noise_std: float
+    residual_std: np.ndarray
+    grid_corrections: tuple[np.ndarray, ...] = ()
+
+    def __post_init__(self) -> None:
+        instants, count, axes = self.values.shape
+        expected = {
+            "times": (self.times, (instants,)),
+            "points": (self.points, (count, 3)),
+            "residual_std": (self.residual_std, (instants,)),
+            **{f"grid_corrections[{k}]": (c, (instants, count, axes)) for k, c in enumerate(self.grid_corrections)},
+        }
+        for name, (array, shape) in expected.items():
+            if array.shape != shape:
+                raise ValueError(f"observation {self.name}: {name} has shape {array.shape}, it must be {shape}")
+        if not 0 <= self.fit_count <= instants:
+            raise ValueError(f"observation {self.name}: fit_count {self.fit_count} is not within 0 and {instants}")
+
+    @property
+    def time_count(self) -> int:
+        """T"""
+        return len(self.times)
+
+    @property
+    def holds_out(self) -> bool:
+        """Whether some instants are not fitted."""
+        return self.fit_count < self.time_count
+
+    @property
+    def grid_correction(self) -> np.ndarray:
+        """Mean (T, N, A) [m] of ``grid_corrections``, a part of which may be added to a model."""
+        return np.mean(self.grid_corrections, axis=0)
+
+    @property
+    def points_in_world(self) -> np.ndarray:
+        """``points`` (N, 3) [m, world]."""
+        return self.points
+
+    @property
+    def values_in_world(self) -> np.ndarray:
+        """``values`` (T, N, A) [m] along axes of the world."""
+        return self.values
+
+    def field_in_world(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, N, A) [m] along axes of the world."""
+        return field
+
+    def residual(self, predicted: np.ndarray) -> np.ndarray:
+        """Predicted less observed (K, N, A) [m] of the first K instants, 0 if nothing was measured. Raises ValueError
+        for another shape of ``predicted`` (K, N, A)."""
+        observed = self.values[: len(predicted)]
+        if predicted.shape != observed.shape:
+            _, count, axes = self.values.shape
+            raise ValueError(
+                f"observation {self.name}: a prediction has shape {predicted.shape}, it must be (K, {count}, {axes}) "
+                f"with K up to {len(self.values)}"
+            )
+        field = predicted - observed
+        return np.where(np.isnan(observed), 0.0, field) if np.isnan(observed).any() else field
+
+    def whiten(self, field: np.ndarray) -> np.ndarray:
+        """A residual (K, N, A) [m] of the first K instants in units of ``residual_std``, times ``noise_std`` [m]: it
+        stays as it is while the noise is all that may differ, and counts for less if the model is less certain."""
+        return field * (self.noise_std / self.residual_std[: len(field), None, None])
+
+
+def rms_mm(fields: Sequence[np.ndarray]) -> float:
+    """Root mean square distance [mm] of residual fields (K, N, A) [m]."""
+    squares = np.concatenate([(f**2).sum(2).ravel() for f in fields])
+    return 1e3 * float(np.sqrt(squares.mean()))

@@ -1,0 +1,126 @@
+"""The model of a clamped body with markers: which rollouts it keeps, and which effects it offers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from masiv.errors import NonFiniteError
+from masiv.identify.tracks import simulation_of
+from masiv.models.base import Model
+from masiv.models.families import family_of
+from masiv.mpm.config import SimulatorConfig
+from masiv.scene.scene import Ground
+from masiv.tracks.config import TracksConfig
+from masiv.tracks.read import read_tracks
+
+pytestmark = pytest.mark.usefixtures("taichi")
+SIMULATOR = SimulatorConfig(courant_number=0.6, max_substeps_per_frame=4000)
+TRACKS = TracksConfig(particles=64, duration=0.05)
+KNOWN = {"youngs_modulus": 2e5, "poissons_ratio": 0.2}
+MODEL = Model(family_of("neo_hookean", 1070, KNOWN), "none")
+
+
+@pytest.fixture(scope="module")
+def bar():
+    tracks = read_tracks(Path(__file__).parent / "golden" / "bar")
+    return replace(tracks, runs=tuple(run for run in tracks.runs if run.name == "own_a"))
+
+
+def heavier(tracks):
+    (name,) = tracks.bodies
+    return replace(tracks, bodies={name: replace(tracks.bodies[name], density=2140.0)})
+
+
+def with_lower_clamp(tracks):
+    (name,) = tracks.bodies
+    clamp = replace(tracks.bodies[name].clamp, heights=tracks.bodies[name].clamp.heights + 0.02)
+    return replace(tracks, bodies={name: replace(tracks.bodies[name], clamp=clamp)})
+
+
+CHANGES = {
+    "density": (heavier, {}),
+    "clamp": (with_lower_clamp, {}),
+    "gravity": (lambda t: replace(t, gravity=0.5 * t.gravity), {}),
+    "law": (lambda t: t, {"youngs_modulus": 1e5}),
+}
+
+
+def model_of(tracks, folder, simulator=SIMULATOR, **known):
+    return simulation_of(tracks, "", TRACKS, simulator, known={**KNOWN, **known}, folder=folder)
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_rollout_of_another_body_is_not_taken_from_disk(bar, tmp_path, what):
+    change, known = CHANGES[what]
+    first = model_of(bar, tmp_path)
+    (before,) = first.fields(MODEL, {})
+    again = model_of(bar, tmp_path)
+    np.testing.assert_array_equal(again.fields(MODEL, {})[0], before)
+    assert (first.rollouts, again.rollouts) == (1, 0)
+    other = model_of(change(bar), tmp_path, **known)
+    (after,) = other.fields(MODEL, {})
+    assert other.rollouts == 1
+    assert np.abs(after - before).max() > 1e-5
+    np.testing.assert_array_equal(after, model_of(change(bar), None, **known).fields(MODEL, {})[0])
+
+
+def test_a_rollout_with_another_substep_is_not_taken_from_disk(bar, tmp_path):
+    """What a law's rollout is depends on the law that was simulated before it, whose substep is held."""
+    family = family_of("neo_hookean", 1070, {"poissons_ratio": 0.2})
+    model = Model(family, "none")
+
+    def fields(folder, *moduli):
+        forward = simulation_of(bar, "", TRACKS, SIMULATOR, known={"poissons_ratio": 0.2}, folder=folder)
+        return [forward.fields(model, {"youngs_modulus": modulus})[0] for modulus in moduli][-1]
+
+    alone, after_a_stiffer_one = fields(None, 1e5), fields(None, 3e5, 1e5)
+    assert np.abs(alone - after_a_stiffer_one).max() > 0
+    np.testing.assert_array_equal(fields(tmp_path, 3e5, 1e5), after_a_stiffer_one)
+    np.testing.assert_array_equal(fields(tmp_path, 1e5), alone)
+
+
+def test_a_law_that_is_stiffer_than_the_held_substep_allows_is_refused(bar):
+    model = Model(family_of("neo_hookean", 1070, {"poissons_ratio": 0.2}), "none")
+    forward = simulation_of(bar, "", TRACKS, SIMULATOR, known={"poissons_ratio": 0.2})
+    forward.fields(model, {"youngs_modulus": 1e5})
+    with pytest.raises(NonFiniteError, match="the law needs substeps of"):
+        forward.fields(model, {"youngs_modulus": 1e6})
+    forward.held.clear()
+    forward.fields(model, {"youngs_modulus": 1e6})
+
+
+def test_effects_that_are_not_simulated_are_not_offered(bar):
+    on_table = replace(bar, ground=Ground(bar.up, -1.0))
+    offered = model_of(on_table, None).candidates(replace(MODEL, contact="sticky"))
+    assert {"linear_drag", "restitution", "point_mass"} <= set(offered)
+    assert not {"time_offset", "ground_height"} & set(offered)
+    assert "restitution" not in model_of(bar, None).candidates(MODEL)
+
+
+def test_shapes_that_do_not_fit_are_refused(bar):
+    forward = model_of(bar, None)
+    (run,) = forward.observations
+    body = forward.body(run)
+    with pytest.raises(ValueError, match=r"a prediction has shape \(3, 2, 3\)"):
+        run.residual(np.zeros((3, 2, 3)))
+    with pytest.raises(ValueError, match=r"residual_std has shape \(3,\), it must be"):
+        replace(run, residual_std=np.ones(3))
+    with pytest.raises(ValueError, match=r"a body's gravity has shape \(2,\)"):
+        replace(body, gravity=np.zeros(2))
+    state = replace(body.released(), velocity=body.released().velocity[1:])
+    with pytest.raises(ValueError, match="the state's velocity has shape"):
+        body.rollout(forward.law(MODEL, {}), state, [1], substep=1e-4, contact="none")
+
+
+def test_what_was_not_measured_leaves_no_residual(bar):
+    (run,) = model_of(bar, None).observations
+    values = run.values.copy()
+    values[2, 1, 0] = np.nan
+    field = replace(run, values=values).residual(run.values + 1.0)
+    expected = np.ones_like(field)
+    expected[2, 1, 0] = 0.0
+    np.testing.assert_allclose(field, expected, rtol=0, atol=1e-12)
