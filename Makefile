@@ -40,6 +40,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/lint-imports --no-cache
 
 wheel-test: $(INSTALLED)
 	$(BIN)/python tests/wheel/check.py $(if $(TORCH_INDEX),--torch-index $(TORCH_INDEX))

@@ -134,7 +134,7 @@ def read_fronts(folder: Path) -> dict[str, np.ndarray]:
 
 
 def misfit(flow: Flow, data: np.ndarray, until: float) -> dict[str, float]:
-    """Root mean square error in Z up to T = ``until``, its mean; and the same where the clock of the measurement may
+    """Root mean square error in Z up to T = ``until``, its mean; and the same if the clock of the measurement may
     have started at another instant (``late`` in T), since the gate opens for a while."""
     from scipy.optimize import minimize_scalar
 
@@ -152,7 +152,7 @@ def misfit(flow: Flow, data: np.ndarray, until: float) -> dict[str, float]:
 
 def scatter(data: dict[str, np.ndarray]) -> dict[str, float]:
     """How far measurements are from each other: root mean square of the differences in Z of each from Martin & Moyce's
-    larger column, where both were measured (and for that, from the smaller)."""
+    larger column, at times when both were measured (and for that, from the smaller)."""
     names = {name: FILES[0] if name == FILES[1] else FILES[1] for name in data}
     out = {}
     for name, other in names.items():

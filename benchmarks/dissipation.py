@@ -1,9 +1,9 @@
-"""How fast the simulator itself damps a swing: a clamped neo-Hookean bar with no viscosity, let go under its weight.
+"""How fast the simulator itself damps a swing: a clamped neo-Hookean bar with no viscosity, released under its weight.
 
     python benchmarks/dissipation.py --cells 4 6 8 --courant 0.3 --poisson 0.45 --time 1.0
 
 The bar is 30 x 30 x 100 mm of silicone. For each grid (cells across its thickness) and Courant number: the frequency
-and the decay rate of its tip, by fitting A exp(-γ t) cos(ω t + φ) + B, beside the frequency of Timoshenko's cantilever.
+and the decay rate of its tip, by fitting A exp(-γ t) cos(ω t + φ) + B, and the frequency of Timoshenko's cantilever.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
-"""Does the learnt law swallow an effect, and does refine prevent it? One material, with and without drag.
+"""Does a fitted law absorb an effect, and does refine prevent it? One material, with and without drag.
 
     python benchmarks/hidden_in_law.py
 
-Laws are learnt from simulated throws of one elastic body (tracks with correlated noise of 2 mm): from a throw without
-drag; from one with drag, which the model is not told; and from the latter after refine, beside what it found.
-A law that swallowed the drag has other stresses over the strains that were observed. Printed: RMS differences of
-Kirchhoff stress in percent of that of another law, over the deformation gradients that the true body goes through in
-the fitted frames, whole and without its pressure, and in uniaxial tension and compression; and the error against the
-motion.
+Laws are fitted to simulated motions of one elastic body (tracks with correlated noise of 2 mm): without drag; with
+drag that the model does not have; and to the latter again with the effect that refine found. A law that absorbed the
+drag has other stresses over the observed strains. Printed: RMS differences of Kirchhoff stress in percent of that of
+another law, over the deformation gradients that the true body reaches in the fitted frames, with and without pressure,
+and in uniaxial tension and compression; and the error of the motion.
 """
 
 import argparse
@@ -49,7 +48,7 @@ def main():
             motion.positions[:FRAMES], motion.times[:FRAMES], motion.volume
         )
 
-    for name, effects in (("no drag", {}), ("drag, not told", {"linear_drag": {"rate": 0.8}})):
+    for name, effects in (("no drag", {}), ("drag, not in the model", {"linear_drag": {"rate": 0.8}})):
         scene, motion = observed(Case(name, kind, parameters, effects, seed=5))
         seen, fitted = cut(scene, motion)
         twin = identify(seen, fitted, config, settings.simulator, seed=0, progress=quiet)
@@ -62,14 +61,14 @@ def main():
     refined = refined_twin(twin, result)
     laws["drag, refine's classical law"] = refined.law
     again = relearn(refined, seen, fitted, config, seed=0, progress=quiet)
-    laws["drag, learnt anew beside the effect"] = again.law
-    errors["drag, learnt anew beside the effect"] = again.fit["trajectory_error_mm"]
+    laws["drag, fitted again with the effect"] = again.law
+    errors["drag, fitted again with the effect"] = again.fit["trajectory_error_mm"]
 
-    gradients = gone_through(refined.with_body(law=laws["truth"]))
+    gradients = gradients_reached(refined.with_body(law=laws["truth"]))
     with torch.no_grad():
         over = {name: law.stress(gradients).double().numpy() for name, law in laws.items()}
     curves = {name: stresses(law) for name, law in laws.items()}
-    print("RMS difference of stress, over what was gone through / the same without pressure / uniaxial\n")
+    print("RMS difference of stress, over the deformation gradients reached / without pressure / uniaxial\n")
     print("| law | against that without drag | against the truth | mean distance to the motion [mm] |")
     print("|---|---|---|---|")
     for name, curve in curves.items():
@@ -87,7 +86,7 @@ def main():
         print(f"| {name} | {cells[0]} | {cells[1]} | {errors.get(name, float('nan')):.1f} |")
 
 
-def gone_through(twin):
+def gradients_reached(twin):
     """Elastic deformation gradients (M, 3, 3) of all particles at the fitted frames."""
     import torch
 

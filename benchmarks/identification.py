@@ -2,14 +2,14 @@
 
     python benchmarks/identification.py OUT --scenes SCENE … [--laws neural true auto …] [--seeds 0 1 …]
                                         [--geometry-loss trajectory …] [--no-silhouette] [--set KEY=VALUE …]
-    python benchmarks/identification.py OUT --scenes SCENE --unseen OTHER_SCENE …      laws of SCENE on other throws
-                                        [--also SCENE …]                               learnt from these throws, too
+    python benchmarks/identification.py OUT --scenes SCENE --unseen OTHER_SCENE …      laws of SCENE on other recordings
+                                        [--also SCENE …]                               fitted to these as well
     python benchmarks/identification.py OUT --table                                    what is there, as Markdown
 
-Law ``true`` is the family that made the scene; ``told`` is not fitted at all: that family with its true parameters and
-the true throw, in the body that was reconstructed, which is what fits could reach in this simulator. A scene is
-reconstructed once a seed and fitted with each law from the same trajectories. A case whose line is in OUT/results.jsonl
-is not run again; one that was killed goes on where it was. The truth is read after the fit.
+Law ``true`` is the family that made the scene, fitted. Law ``reference`` is not fitted: that family with its true
+parameters and the true initial state, in the reconstructed body; fits in this simulator could reach that. A scene is
+reconstructed once for each seed, and all laws are fitted to the same trajectories. A case whose line is in
+OUT/results.jsonl is not run again, and an interrupted one is resumed. The truth is read after the fit.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ PICTURES = ("psnr_db", "psnr_box_db", "psnr_box_in_scene_db", "ssim", "ssim_box"
 
 @dataclass(frozen=True)
 class Case:
-    """One fit. settings: configuration keys beside the preset's, as KEY=VALUE. also: scenes of more throws."""
+    """One fit. settings: configuration keys over the preset, as KEY=VALUE. also: scenes of more recordings."""
 
     scene: Path
     law: str
@@ -75,7 +75,7 @@ class Case:
 
 
 def overrides(settings: tuple[str, ...], path: Path) -> Path | None:
-    """A configuration file of ``settings``, or None where there are none."""
+    """A configuration file of ``settings``, or None if there are none."""
     if not settings:
         return None
     nested: dict[str, Any] = {}
@@ -92,7 +92,7 @@ def overrides(settings: tuple[str, ...], path: Path) -> Path | None:
 
 
 def base_run(case: Case, out: Path, preset: str, fit_frames: int) -> Path:
-    """The run with the scene's reconstruction and trajectories, made now where it lacks them."""
+    """The run with the scene's reconstruction and trajectories, made now if they are missing."""
     upstream = tuple(s for s in case.settings if s.startswith(("reconstruct.", "trajectory.")))
     folder = out / case.scene.name / "-".join(["base", f"seed{case.seed}", *upstream])
     if (folder / "run.yaml").is_file() and RunFolder.open(folder).done("trajectory"):
@@ -116,7 +116,7 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
     family = FAMILY[truth_of(case.scene)["material"]["type"]]
     also = [base_run(dataclasses.replace(case, scene=scene), out, preset, fit_frames) for scene in case.also]
     asked = {
-        "law": family if case.law in ("true", "told") else case.law,
+        "law": family if case.law in ("true", "reference") else case.law,
         "geometry_loss": case.geometry_loss,
         "pictures": None if case.silhouette else 0,
         "also": [str(path.resolve()) for path in also] or None,
@@ -127,8 +127,8 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
     opened.start()
     run, settings, scene = opened.folder, opened.config, opened.scene
     trajectory = stages.load_trajectory(run)
-    if case.law == "told":
-        told(case.scene, scene, trajectory, settings.simulator).save(run.path)
+    if case.law == "reference":
+        reference_twin(case.scene, scene, trajectory, settings.simulator).save(run.path)
     elif not run.done("identify"):
         with run.stage("identify") as checkpoint:
             identify(
@@ -141,12 +141,12 @@ def fit(case: Case, base: Path, out: Path, preset: str, fit_frames: int) -> dict
 
 
 def truth_of(scene: Path) -> dict[str, Any]:
-    """What made the scene: for the table, for law ``told``, and for the name of the family that ``true`` stands for."""
+    """What made the scene: for the table, for law ``reference``, and for the family of law ``true``."""
     return yaml.safe_load((scene / "truth.yaml").read_text(encoding="utf-8"))
 
 
-def told(folder: Path, scene: Scene, trajectory: Trajectory, simulator: SimulatorConfig) -> Twin:
-    """The reconstructed body with the throw, ground and law of truth.yaml."""
+def reference_twin(folder: Path, scene: Scene, trajectory: Trajectory, simulator: SimulatorConfig) -> Twin:
+    """The reconstructed body with the initial state, ground and law of truth.yaml."""
     truth = truth_of(folder)
     return Twin.of_body(
         positions=trajectory.positions[0], velocity=np.array(truth["initial_velocity"], float),
@@ -190,8 +190,8 @@ def said(stage: str, done: int, total: int, note: str = "") -> None:
         print(f"  {stage} {done}/{total} {note}", file=sys.stderr, flush=True)
 
 
-def identifiability_issue(twin: Twin, other: Path, scene: Path) -> dict[str, Any]:
-    """The law of ``twin`` on another throw, of which run ``other`` gives the body and, from its free flight alone, the
+def unseen_recording(twin: Twin, other: Path, scene: Path) -> dict[str, Any]:
+    """The law of ``twin`` on another recording, of which run ``other`` gives the body and, from free flight alone,
     velocity and spin: no frame after the first contact is looked at. Ground and contact are those of ``twin``."""
     run, read = RunFolder.open(other), read_scene(scene)
     trajectory = stages.load_trajectory(run)
@@ -221,8 +221,8 @@ def main() -> None:
     parser.add_argument("--geometry-loss", nargs="+", default=["trajectory"])
     parser.add_argument("--no-silhouette", action="store_true")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="configuration over the preset")
-    parser.add_argument("--unseen", type=Path, nargs="+", default=[], help="throws that a law of --scenes is tried on")
-    parser.add_argument("--also", type=Path, nargs="+", default=[], help="more throws that the law is learnt from")
+    parser.add_argument("--unseen", type=Path, nargs="+", default=[], help="recordings to test a law of --scenes on")
+    parser.add_argument("--also", type=Path, nargs="+", default=[], help="more recordings that the law is fitted to")
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--fit-frames", type=int, default=12)
     parser.add_argument("--table", action="store_true", help="print the tables and do nothing else")
@@ -239,14 +239,14 @@ def main() -> None:
             base = base_run(case, o.out, o.preset, o.fit_frames)
             keep(results, rows, {"case": key, "preset": o.preset, **fit(case, base, o.out, o.preset, o.fit_frames)})
             print(f"{key}: {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
-        for other in o.identifiability_issue:
+        for other in o.unseen:
             key = f"{scene.name}/{case.name} on {other.name}"
             if key not in done:
                 base = base_run(dataclasses.replace(case, scene=other), o.out, o.preset, o.fit_frames)
-                learnt = Twin.load(o.out / scene.name / case.name)
-                found = identifiability_issue(learnt, base, other)
+                fitted = Twin.load(o.out / scene.name / case.name)
+                found = unseen_recording(fitted, base, other)
                 keep(results, rows, {
-                    "case": key, "what": "unseen", "scene": scene.name, "law": law, "fitted": learnt.law.kind,
+                    "case": key, "what": "unseen", "scene": scene.name, "law": law, "fitted": fitted.law.kind,
                     "on": other.name, "seed": seed, "settings": list(case.settings),
                     "also": [s.name for s in case.also], **found,
                 })  # fmt: skip

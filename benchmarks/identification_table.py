@@ -33,10 +33,10 @@ def fit_table(rows: list[Mapping[str, Any]]) -> str:
             both(row, "psnr_box_db", ".1f"),
             both(row, "ssim_box", ".3f"),
             both(row, "psnr_box_in_scene_db", ".1f"),
-            "–" if row["law"] == "told" else f"{row['seconds']['identify']:.0f}",
+            "–" if row["law"] == "reference" else f"{row['seconds']['identify']:.0f}",
         ]
         law = row["fitted"] if row["law"] == "true" else row["law"]
-        if row["law"] in ("auto", "told"):
+        if row["law"] in ("auto", "reference"):
             law = f"{row['law']}: {row['fitted']}"
         lines.append(f"| {row['scene']} | {', '.join([law, *variant(row)])} | {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -58,9 +58,9 @@ def both(row: Mapping[str, Any], name: str, form: str) -> str:
 
 
 def parameter_table(rows: list[Mapping[str, Any]]) -> str:
-    """Recovered beside true, of fits whose family is the one that made the scene."""
+    """Recovered and true parameters, of fits whose family is the one that made the scene."""
     lines = []
-    for row in (r for r in rows if r["law"] != "told"):
+    for row in (r for r in rows if r["law"] != "reference"):
         for name, entry in row["parameters"].items():
             if entry.get("true") is None:
                 continue
@@ -76,18 +76,18 @@ def parameter_table(rows: list[Mapping[str, Any]]) -> str:
 
 
 def unseen_table(rows: list[Mapping[str, Any]]) -> str:
-    """A law on a throw that it was not fitted to."""
+    """A law on a recording that it was not fitted to."""
     if not rows:
         return ""
     lines = [
-        "| law | learnt on | thrown as | Chamfer after contact (floor) [10³ mm²] | tracked [mm] |",
+        "| law | fitted to | tested on | Chamfer after contact (floor) [10³ mm²] | tracked [mm] |",
         "|---|---|---|---|---|",
     ]
     for row in rows:
         found = row["after contact"]
-        learnt = ", ".join([row["scene"], *row.get("also", [])])
+        fitted_to = ", ".join([row["scene"], *row.get("also", [])])
         lines.append(
-            f"| {row['fitted']} | {learnt} | {row['on']} | {found['chamfer_1e3mm2']:.3f} ({row['floor']:.3f}) "
+            f"| {row['fitted']} | {fitted_to} | {row['on']} | {found['chamfer_1e3mm2']:.3f} ({row['floor']:.3f}) "
             f"| {found['tracked_error_mm']:.1f} |"
         )
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Speed of the simulator: million particle-substeps a second, forward and forward + backward, beside plain Taichi
+"""Speed of the simulator: million particle-substeps a second, forward and forward + backward, and that of plain Taichi
 autodiff.
 
     python benchmarks/mpm_speed.py [--arch cpu] [--quick] > benchmarks/mpm_speed.md

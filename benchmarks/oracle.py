@@ -1,4 +1,4 @@
-"""How well a model does that was told which effects are missing."""
+"""How well a model does if it knows the true law and the true effects."""
 
 from __future__ import annotations
 
@@ -6,23 +6,25 @@ from collections.abc import Mapping, Sequence
 
 
 def oracle(simulation, result, *, law: str, contact: str, parameters: Mapping[str, float], effects: Mapping) -> dict:
-    """{fit_mm, held_out_mm, values} of ``told``, whose throw begins at that of refine's model without effects, or of
-    its last; {problem} where both diverge."""
+    """{fit_mm, held_out_mm, values} of ``fit_true_model`` from the initial states of refine's model without effects and
+    of its last one; {problem} if both diverge."""
     from masiv.errors import MasivError
 
     starts = [result.before] if result.after is result.before else [result.before, result.after]
     try:
         # Its own substeps: those that the search settled on may be too long for the true stiffness.
-        best = told(type(simulation)(simulation.observations), starts, law, contact, parameters, effects)
+        best = fit_true_model(type(simulation)(simulation.observations), starts, law, contact, parameters, effects)
     except MasivError as failed:
         return {"problem": str(failed)}
     found = {n: v for n, v in best.values.items() if "@" not in n}
     return {"fit_mm": best.fit_mm, "held_out_mm": best.held_out_mm, "values": found}
 
 
-def told(simulation, starts: Sequence, law: str, contact: str, parameters: Mapping[str, float], effects: Mapping):
-    """The true law with the true effects, fitted from their true values and the throws of ``starts``: the best of these
-    fits. Raises MasivError where all diverge.
+def fit_true_model(
+    simulation, starts: Sequence, law: str, contact: str, parameters: Mapping[str, float], effects: Mapping
+):
+    """The true law with the true effects, fitted from their true values and the initial states of ``starts``: the best
+    of these fits. Raises MasivError if all diverge.
 
     parameters: of the law, effects: {effect: {parameter: value}}.
     """
@@ -35,9 +37,9 @@ def told(simulation, starts: Sequence, law: str, contact: str, parameters: Mappi
     true = {p.name: effects[n][p.name.split(".")[1]] for n in effects for p in effect_parameters(n)}
     fits, problem = [], None
     for start in starts:
-        throw = {n: v for n, v in start.values.items() if "@" in n}
+        initial_states = {n: v for n, v in start.values.items() if "@" in n}
         try:
-            fits.append(gauss_newton_fit(simulation, model, {**throw, **parameters, **true}, budget=24))
+            fits.append(gauss_newton_fit(simulation, model, {**initial_states, **parameters, **true}, budget=24))
         except MasivError as failed:
             problem = failed
     if problem is not None and not fits:

@@ -1,4 +1,4 @@
-"""What does refine name in filmed scenes, and how near does it come to a model that was told?
+"""What does refine name in filmed scenes, and how near does it come to a model that knows the truth?
 
     python benchmarks/refine_scenes.py RUN SCENE/truth.yaml --out FILE.jsonl [--second-run RUN2]
     python benchmarks/refine_scenes.py --table FILE.jsonl
@@ -59,19 +59,21 @@ def measured(run, truth_file, second, given):
     done = time.time()
     document = document_of(result)
     effects = true_effects(truth)
-    told = None
+    known_truth = None
     law = FAMILIES[truth["material"]["type"]]
     known = {PARAMETERS[k]: float(v) for k, v in truth["material"].items() if k in PARAMETERS}
     if effects:
         contact = result.after.model.contact
-        told = oracle(result.forward_model, result.search, law=law, contact=contact, parameters=known, effects=effects)
+        known_truth = oracle(
+            result.forward_model, result.search, law=law, contact=contact, parameters=known, effects=effects
+        )
     keep = ("verdict", "candidates", "accepted", "before", "after", "reduced_chi", "rounds", "laws")
     return {
         "run": run.name,
         "second": [p.name for p in second],
         "true": effects,
         "document": {k: document[k] for k in keep if k in document},
-        "oracle": told,
+        "oracle": known_truth,
         "rollouts": result.forward_model.rollouts,
         "seconds": [loaded - began, done - loaded],
     }
@@ -86,7 +88,7 @@ def table(path):
     print("|---|---|---|---|---|---|---|---|")
     for line in Path(path).read_text().splitlines():
         r = json.loads(line)
-        d, told = r["document"], r["oracle"]
+        d, best = r["document"], r["oracle"]
         ranked = ", ".join(f"{c['effect']} {100 * c['explained']:.0f} %" for c in d["candidates"][:2])
         values = "; ".join(
             f"{a['effect']} " + ", ".join(f"{v:.3g} ± {a['stderr'][n]:.2g}" for n, v in a["theta"].items())
@@ -94,7 +96,7 @@ def table(path):
         )
         pair = "{:.1f} / {:.1f}".format
         shown = " + ".join([r["run"], *r["second"]])
-        oracle = "–" if not told else told.get("problem") or pair(told["fit_mm"], told["held_out_mm"])
+        oracle = "–" if not best else best.get("problem") or pair(best["fit_mm"], best["held_out_mm"])
         parts = ("fit", "held_out")
         before, after = ([d[k][part]["trajectory_rmse_mm"] for part in parts] for k in ("before", "after"))
         cells = (shown, ", ".join(r["true"]) or "none", ranked, values or d["verdict"], pair(*before), pair(*after),

@@ -1,9 +1,9 @@
-"""Which effect does refine name? Simulated throws with undeclared effects, as tracks with correlated noise.
+"""Which effect does refine name? Simulated motions with undeclared effects, as tracks with correlated noise.
 
     python benchmarks/refine_tracks.py --out FILE.jsonl [--only NAME] [--particles 1500] [--set KEY=VALUE …]
 
 One JSON line a case; cases already in FILE are skipped, so that a stopped run goes on. ``--table FILE`` prints the
-confusion table. ``--oracle`` fits models that were told, instead; ``--table FILE --oracles FILE2`` shows both.
+confusion table. ``--oracle`` fits models that know the true effects; ``--table FILE --oracles FILE2`` shows both.
 """
 
 import argparse
@@ -46,7 +46,7 @@ STRENGTHS = {
 }  # fmt: skip
 
 OTHER = {"viscosity": "stiff", "restitution": "stiff"}
-"""The second material of an effect, where that is not the plastic one: what damps or bounces hardly shows there."""
+"""The second material of an effect, if that is not the plastic one: what damps or bounces hardly shows there."""
 OUTSIDE = {
     "attraction": {"strength": 0.5, "x": 0.6, "y": 0.7, "z": 0.5},
     "gust": {"acceleration": 20.0, "begin": 0.1, "end": 0.2},
@@ -114,9 +114,9 @@ def baseline_fits(case, config):
     return simulation, setup.observation, fits
 
 
-def told_of(case, config):
-    """Error of a model that was told, whitened as refine whitens its result: as that model moves."""
-    from oracle import told
+def oracle_of(case, config):
+    """Error of a model that knows the true effects, whitened as refine whitens its result: as that model moves."""
+    from oracle import fit_true_model
 
     from masiv.inference.discretization import with_residual_std
     from masiv.models.free_body import FreeBodyModel
@@ -128,9 +128,9 @@ def told_of(case, config):
     simulation = with_residual_std(simulation, best, observation_std)
     own = FreeBodyModel(simulation.setups)  # with substeps that the true stiffness asks for
     own = own.with_observations(simulation.observations)
-    best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
+    best = fit_true_model(own, [best], case.law, case.contact, case.parameters, case.effects)
     own = with_residual_std(own, best, observation_std)
-    best = told(own, [best], case.law, case.contact, case.parameters, case.effects)
+    best = fit_true_model(own, [best], case.law, case.contact, case.parameters, case.effects)
     return {"case": case.name, "oracle": [best.fit_mm, best.held_out_mm], "seconds": [time.time() - began]}
 
 
@@ -179,7 +179,7 @@ def quiet(*_):
     """No progress."""
 
 
-ANSWERS = "named", "named, with others beside it", "one of others beside it", "abstained", "wrong"
+ANSWERS = "named", "named, not distinguished", "among those not distinguished", "abstained", "wrong"
 
 
 def lines(path):
@@ -187,15 +187,17 @@ def lines(path):
 
 
 def table(path, oracles):
-    rows, told = lines(path), {r["case"]: r["oracle"] for r in lines(oracles)} if oracles else {}
+    rows, errors = lines(path), {r["case"]: r["oracle"] for r in lines(oracles)} if oracles else {}
     counts = dict.fromkeys(ANSWERS, 0)
-    print("| case | accepted | may as well be | first ranked | before fit / held out [mm] | after | oracle | s |")
+    print(
+        "| case | accepted | indistinguishable from | ranked first | before: fit / held out [mm] | after | oracle | s |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for r in rows:
         counts[judged(r)] += 1
         others = ", ".join(other for names in r["indistinguishable_from"].values() for other in names)
         show = [" / ".join(f"{v:.1f}" for v in pair) if pair else "–"
-                for pair in (r["before"], r["after"], told.get(r["case"]))]  # fmt: skip
+                for pair in (r["before"], r["after"], errors.get(r["case"]))]  # fmt: skip
         ranked = f"{r['ranked'][0][0]} {r['ranked'][0][1]}" if r["ranked"] else "–"
         print(f"| {r['case']} | {', '.join(r['accepted']) or 'none'} | {others} | {ranked} | {show[0]} | {show[1]} | "
               f"{show[2]} | {sum(r['seconds']):.0f} |")  # fmt: skip
@@ -208,10 +210,10 @@ def judged(row):
     true, found = set(row["true"]), set(row["accepted"])
     others = {other for names in row["indistinguishable_from"].values() for other in names}
     if found == true or (row["verdict"] == "unexplained residual" and not true <= STRENGTHS.keys()):
-        return "named, with others beside it" if others else "named"
+        return "named, not distinguished" if others else "named"
     if not found:
         return "abstained"
-    return "one of others beside it" if true <= found | others else "wrong"
+    return "among those not distinguished" if true <= found | others else "wrong"
 
 
 def main():
@@ -219,11 +221,11 @@ def main():
     parser.add_argument("--out", default="refine_tracks.jsonl")
     parser.add_argument("--only", default="")
     parser.add_argument("--particles", type=int, default=1500)
-    parser.add_argument("--laws", default="", help="families that compete, with commas; the case's own where empty")
+    parser.add_argument("--laws", default="", help="families that compete, with commas; the case's own if empty")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of refine")
     parser.add_argument("--per-cell", type=float, default=6.0, help="particles a cell of the truth's grid")
     parser.add_argument("--draw", type=int, default=0, help="another draw of the noise")
-    parser.add_argument("--oracle", action="store_true", help="fit models that were told the effect, instead")
+    parser.add_argument("--oracle", action="store_true", help="fit models that know the true effects instead")
     parser.add_argument("--table")
     parser.add_argument("--oracles", help="with --table: the file that --oracle wrote")
     options = parser.parse_args()
@@ -240,12 +242,12 @@ def main():
         if case.name in done or (options.only and options.only not in case.name):
             continue
         if options.oracle and case.outside:
-            continue  # no model of the library could be told
+            continue  # no model of the library has it
         laws = [n for n in options.laws.split(",") if n] or [case.law]
         settings = {"particles": options.particles, "laws": laws}
         settings |= {key: yaml.safe_load(value) for key, value in (s.split("=", 1) for s in options.set)}
         case = dataclasses.replace(case, per_cell=options.per_cell, seed=case.seed + 1000 * options.draw)
-        row = (told_of if options.oracle else refined)(case, RefineConfig.model_validate(settings))
+        row = (oracle_of if options.oracle else refined)(case, RefineConfig.model_validate(settings))
         with out.open("a") as file:
             file.write(json.dumps(row) + "\n")
         answer = row["oracle"] if options.oracle else row["accepted"]

@@ -33,8 +33,8 @@ SHAPE = ShapeSpec(kind="capsule", size=0.5, rotation_deg=(20.0, 0.0, 35.0), clea
 
 @dataclass(frozen=True)
 class Case:
-    """effects: {name: {parameter: value}}, what the model is not told. outside: the same of ``unknown_effects``, which
-    no library has."""
+    """effects: {name: {parameter: value}}, what the model does not know. outside: the same of
+    ``unknown_effects``, which no library has."""
 
     name: str
     law: str

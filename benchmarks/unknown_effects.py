@@ -27,7 +27,7 @@ def _swollen(tau, f, c_affine, c):
 
 
 class Attraction(NodalEffect):
-    """A charged or magnetic body beside the path: dv/dt = k r / |r|^3."""
+    """A charged or magnetic body near the path: dv/dt = k r / |r|^3."""
 
     name = "attraction"
     looks_like = "the path bends towards a point"

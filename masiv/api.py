@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from masiv import runtime
+from masiv.checkpoint import Checkpoint
 from masiv.config import Config, load_config
 from masiv.errors import InputError
 from masiv.observations.read import read_scene
@@ -53,7 +54,7 @@ def reconstruct(scene: Scene, config: Config | None = None, *, progress: Progres
     from masiv.splat.reconstruct import reconstruct as stage
 
     config = _started(config)
-    return stage(scene, config.reconstruct, seed=config.seed, progress=progress)
+    return stage(scene, config.reconstruct, seed=config.seed, checkpoint=Checkpoint(None), progress=progress)
 
 
 def estimate_trajectory(

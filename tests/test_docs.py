@@ -11,7 +11,7 @@ import yaml
 
 import masiv
 from masiv.cli.main import app
-from masiv.config import Config
+from masiv.config import RENAMED_KEYS, Config
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")])
@@ -144,3 +144,10 @@ def test_version_is_the_same_everywhere():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == masiv.__version__
     assert f"\n## {masiv.__version__} " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_changelog_has_the_settings_that_were_renamed():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    named = set(inline_code(text))
+    assert RENAMED_KEYS
+    assert {old.partition(".")[2] for old in RENAMED_KEYS} | set(RENAMED_KEYS.values()) <= named

@@ -25,7 +25,7 @@ from masiv.observations.motion import SampledMotion
 from masiv.observations.noise_floor import noise_floor
 from masiv.refine.config import RefineConfig
 from masiv.refine.document import document as document_of
-from masiv.refine.from_video import Recording, refine_recordings, split_frames
+from masiv.refine.from_video import Recording, refine_recordings
 from masiv.scene.scene import Ground, Scene
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -148,12 +148,6 @@ def test_noise_of_a_rigid_flight_is_found_whatever_the_flight():
     noisy = np.array(path)
     noisy[1:] += random.normal(0, 2e-3, noisy[1:].shape)
     assert noise_floor(noisy, 7) == pytest.approx(2e-3 * np.sqrt(6), rel=0.05)
-
-
-def test_held_out_frames_are_the_runs_own_or_the_last_quarter():
-    assert split_frames(16, 12) == 12
-    assert split_frames(16, 16) == 12
-    assert split_frames(5, 5) == 4
 
 
 def test_steps_stay_within_bounds_and_keep_what_is_not_fitted():

@@ -10,8 +10,8 @@ from linear_model import EFFECTS, NOISE, ONES, POINTS, TIMES, LinearModel, basel
 
 from masiv.errors import InputError, MasivError
 from masiv.inference.model_fit import gauss_newton_fit
+from masiv.models.base import Model
 from masiv.models.families import Family
-from masiv.models.free_body import Model
 from masiv.refine.candidates import score
 from masiv.refine.config import RefineConfig
 from masiv.refine.document import document, text
@@ -81,8 +81,8 @@ def test_arguments_stay_as_they_are():
     assert model.observations is observations
     np.testing.assert_array_equal(observations[0].residual_std, std)
     assert base.values == values
-    assert (changing.observations[0], own.grid_changes) == (own, ())
-    assert len(result.observations[0].grid_changes) == 2  # its own are known to the result
+    assert (changing.observations[0], own.grid_corrections) == (own, ())
+    assert len(result.observations[0].grid_corrections) == 2  # its own are known to the result
 
 
 class Grids(LinearModel):

@@ -6,6 +6,8 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +17,10 @@ from small import SMALL
 from test_tracks_group import Ball, write_scene
 
 from masiv.cli import main
+from masiv.config import Config
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
+from masiv.identify.from_tracks import described_twin
 from masiv.identify.tracks import fit_law, simulation_of
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
@@ -27,9 +31,13 @@ from masiv.models.marked_body import marked_body
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.refine.candidates import score
 from masiv.refine.config import RefineConfig
+from masiv.refine.document import arrays, document
 from masiv.refine.effect_fit import fit_with_effect
+from masiv.refine.from_tracks import refine_tracks
 from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import refine
+from masiv.refine.to_twin import refined_twin
+from masiv.simulation.fitted_twin import fitted_twin, place_of
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.read import read_tracks
 
@@ -142,6 +150,71 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     assert after.held_out_mm < 0.2 < 0.1 * result.before.held_out_mm
     share = {c.effect: c.explained for c in result.search.rounds[0].candidates}
     assert 1 - share["point_mass"] < 0.2 * (1 - share["gravity_scale"])
+
+
+@pytest.mark.slow
+def test_one_body_from_its_law_to_its_twin(bar, tmp_path):
+    """As the command does it: the law refitted with an effect, a second time from the rollouts on disk, the twin with
+    what was accepted, and another condition on top of that."""
+    config = Config.model_validate({
+        "simulator": SIMULATOR.model_dump(), "tracks": TRACKS.model_dump(),
+        "refine": {"effects": ["viscosity"], "shortlist": 1, "max_effects": 1},
+    })  # fmt: skip
+    known = {"poissons_ratio": RATIO}
+    simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known=known)
+    model = Model(family_of("neo_hookean", 1070, known), "none")
+    base = gauss_newton_fit(simulation, model, {"youngs_modulus": YOUNGS}, budget=6)
+    twin = fitted_twin(described_twin(bar, config), base, simulation, {})
+    result = refine_tracks(bar, twin, config, folder=tmp_path)
+    assert [t.name for t in result.accepted] == ["viscosity"]
+    assert result.condition == ""
+    assert result.places == {}
+    written = document(result)
+    assert [(o["observation"], list(o["after_mm"])) for o in written["observations"]] == [
+        ("own_a", ["fit"]), ("own_b", ["held_out"])
+    ]  # fmt: skip
+    assert set(arrays(result)) >= {"observed@own_a", "before@own_b", "after@own_b", "times@own_a"}
+    again = refine_tracks(bar, twin, config, folder=tmp_path)
+    assert (again.forward_model.rollouts, again.after.values) == (0, result.after.values)
+    refined = refined_twin(twin, result)
+    assert [(e.name, e.condition) for e in refined.effects] == [("viscosity", None)]
+    assert refined.law.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.02)
+    assert twin.effects == ()
+    load = config.model_copy(update={"refine": RefineConfig.model_validate({"effects": ["gravity_scale"]})})
+    other = refine_tracks(bar, refined, load, condition="load", dry_run=True)
+    assert other.verdict == "ranked only"
+    assert other.before.model.effects == ("viscosity",)  # what is known acts
+    assert [c.effect for c in other.search.rounds[0].candidates] == ["gravity_scale"]
+    assert refined_twin(refined, other) is refined
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"refine": {"particles": 200}}, "refine.particles is for scenes of pictures: leave it out, tracks have"),
+        ({"refine": {"laws": ["newtonian"]}}, "refine.laws"),
+        ({"refine": {"tracking_error": 0.1}}, "refine.tracking_error"),
+        ({"refine": {"processes": 2}}, "tracks are simulated in one process"),
+        ({"identify": {"contact": "release"}}, "tracks know a sticky ground alone"),
+        ({"refine": {"effects": ["ether"]}}, "unknown effect 'ether'"),
+    ],
+)
+def test_settings_that_say_nothing_of_tracks_are_refused(bar, settings, words):
+    nothing: Any = None
+    with pytest.raises(InputError, match=words):
+        refine_tracks(bar, nothing, Config.model_validate(settings))
+
+
+def test_a_place_is_told_in_the_body(bar):
+    simulation = simulation_of(bar, "load", TRACKS, SIMULATOR, known={"poissons_ratio": RATIO})
+    run = simulation.observations[0]
+    tip = np.array([0.0, 0.0, 0.05])  # own axes
+    placement = next(r for r in bar.runs if r.name == run.name).placement
+    x, y, z = run.body.frame.points_to_simulation(placement.to_world(tip[None]))[0]
+    values = {"point_mass.x": float(x), "point_mass.y": float(y), "point_mass.z": float(z)}
+    fitted: Any = SimpleNamespace(values=values)
+    assert place_of(simulation, "point_mass", fitted) == pytest.approx(tuple(tip), abs=1e-9)
+    assert place_of(simulation, "viscosity", fitted) is None
 
 
 def test_a_static_deflection_strains_as_it_moves(bar):

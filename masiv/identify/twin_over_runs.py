@@ -7,16 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from masiv.config import Config
 from masiv.identify.from_tracks import group_of
 from masiv.identify.tracks import only_body, simulation_of
 from masiv.models.base import Model
 from masiv.models.clamped_body import ClampedBodyModel
 from masiv.models.families import family_of
 from masiv.models.point_mass import RIGID, PointMassModel
+from masiv.mpm.config import SimulatorConfig
 from masiv.observations.base import rms_mm
 from masiv.observations.tracks import TracksObservation, flight_observations
 from masiv.simulation.fitted_twin import effect_values, law_values, start_values
+from masiv.tracks.config import TracksConfig
 from masiv.tracks.tracks import Tracks
 from masiv.twin import Twin
 
@@ -34,7 +35,9 @@ class TwinSimulation:
         return self.simulation.fields(self.model, self.values, held_out=True)
 
 
-def simulated(tracks: Tracks, twin: Twin, config: Config, condition: str | None = None) -> TwinSimulation:
+def simulate_runs(
+    tracks: Tracks, twin: Twin, config: TracksConfig, simulator: SimulatorConfig, condition: str | None = None
+) -> TwinSimulation:
     """``twin`` over the runs of ``condition`` (None: the first)."""
     group = group_of(tracks)
     if group is not None:
@@ -46,7 +49,7 @@ def simulated(tracks: Tracks, twin: Twin, config: Config, condition: str | None 
         )
     twin = twin.in_condition(condition)
     law = law_values(twin)
-    simulation = simulation_of(tracks, twin.conditions[0], config.tracks, config.simulator, known=law)
+    simulation = simulation_of(tracks, twin.conditions[0], config, simulator, known=law)
     model = Model(
         family_of(twin.law.kind, only_body(tracks).density or 1e3, law),
         simulation.contact,
@@ -56,7 +59,7 @@ def simulated(tracks: Tracks, twin: Twin, config: Config, condition: str | None 
     return TwinSimulation(simulation, model, {**start_values(twin), **values})
 
 
-def run_errors(runs: Sequence[TracksObservation | TracksObservation], fields: Sequence[np.ndarray]) -> list[dict]:
+def run_errors(runs: Sequence[TracksObservation], fields: Sequence[np.ndarray]) -> list[dict]:
     """Root mean square distance of each run [mm]."""
     return [
         {"run": run.name, "use": "fit" if run.fitted else "hold_out", "rmse_mm": rms_mm([f]), "instants": len(f)}

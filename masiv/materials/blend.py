@@ -46,8 +46,8 @@ class BlendedLaw(Law):
     Rates are decades apart (e^-14 of an elastic body, e^14 per second of a fluid), so they are blended geometrically.
     In steady flow the elastic strain of a law is inversely proportional to its rate. So the law that flows faster than
     the blend is evaluated at the fraction min(1, r / r_i) of the strain: it would never have reached all of it. Both
-    laws are at rest at F = I, isotropic and frame indifferent, with positive moduli, and so is the blend; it does not depend
-    on the substep either. Forward only.
+    laws are at rest at F = I, isotropic and frame indifferent, with positive moduli. So is the blend, which does not
+    depend on the substep either. Forward only.
     """
 
     kind = "blended"

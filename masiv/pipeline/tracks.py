@@ -57,6 +57,10 @@ class TracksRun(Run):
                 f"--law {config.identify.law} needs the motion of a whole body, and markers show a few points of it: "
                 "use --law auto or a classical law"
             )
+        if config.identify.contact not in ("auto", "sticky"):
+            raise InputError(
+                f"identify.contact: {config.identify.contact} is for scenes of pictures: the ground of tracks is sticky"
+            )
         tracks = read_tracks(scene)
         asked = Request(config.model_dump(mode="json"), scene, identity(tracks), 0)
         return cls(RunFolder.create_or_resume(out, asked), config, tracks)
@@ -71,7 +75,10 @@ class TracksRun(Run):
             twin = self._load_twin()
         else:
             with self.folder.stage("identify"):
-                twin, fits = identify_tracks(self.tracks, self.config, folder=self._rollout_cache, progress=progress)
+                twin, fits = identify_tracks(
+                    self.tracks, self.config.identify.law, self.config.tracks, self.config.simulator,
+                    folder=self._rollout_cache, progress=progress,
+                )  # fmt: skip
                 families = [
                     {"law": f.model.family.kind, "fit_rmse_mm": f.fit_mm, "held_out_rmse_mm": f.held_out_mm}
                     for f in fits
@@ -102,8 +109,8 @@ class TracksRun(Run):
         if request.group and not twin.rigid:
             raise InputError(f"{self.path} is of one body: --group is for bodies that fly free and share physics")
         result = refine_tracks(
-            self.tracks, twin, self.config, condition=request.condition, dry_run=request.dry_run,
-            folder=self._rollout_cache, progress=progress,
+            self.tracks, twin, self.config.refine, self.config.tracks, self.config.simulator,
+            condition=request.condition, dry_run=request.dry_run, folder=self._rollout_cache, progress=progress,
         )  # fmt: skip
         written = document(result)
         stem = refine_stem(request.condition, first)
@@ -177,12 +184,12 @@ class TracksRun(Run):
     def _described_twin(self) -> Twin:
         from masiv.identify.from_tracks import described_twin
 
-        return described_twin(self.tracks, self.config)
+        return described_twin(self.tracks, self.config.tracks, self.config.simulator)
 
     def _report(self, twin: Twin, progress: Progress) -> list[dict[str, Any]]:
         """Simulate every run with the twin, and with the one before refine if there is one; metrics.json, rollout.npz,
         report.html. Returns the errors of each run."""
-        from masiv.identify.twin_over_runs import run_errors, simulated
+        from masiv.identify.twin_over_runs import run_errors, simulate_runs
         from masiv.refine.document import with_scopes
         from masiv.report.tracks import write_report
         from masiv.twin.identified import IDENTIFIED_FILE, load_identified
@@ -198,7 +205,7 @@ class TracksRun(Run):
                 continue
             for name, model in twins.items():
                 progress("report: simulate", done, len(conditions), name)
-                made = simulated(self.tracks, model, self.config, condition)
+                made = simulate_runs(self.tracks, model, self.config.tracks, self.config.simulator, condition)
                 observations, fields = made.simulation.observations, made.fields()
                 for observation, field in zip(observations, fields, strict=True):
                     observed = observation.values_in_world

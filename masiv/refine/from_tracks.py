@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from masiv import runtime
-from masiv.config import Config
 from masiv.errors import InputError
 from masiv.identify.from_tracks import group_of
 from masiv.identify.tracks import conditions, only_body, runs_of, simulation_of
@@ -15,6 +14,7 @@ from masiv.materials.classical import ClassicalLaw
 from masiv.models.base import Model
 from masiv.models.families import family_of
 from masiv.models.point_mass import PointMassModel
+from masiv.mpm.config import SimulatorConfig
 from masiv.observations.tracks import flight_observations
 from masiv.progress import Progress, silent
 from masiv.refine.config import RefineConfig
@@ -23,6 +23,7 @@ from masiv.refine.result import RefineResult
 from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import check_effects, refine
 from masiv.simulation.fitted_twin import effect_values, law_values, place_of, start_values
+from masiv.tracks.config import TracksConfig
 from masiv.tracks.tracks import Tracks
 from masiv.twin import Twin
 
@@ -39,8 +40,8 @@ NOT_FOR_TRACKS = {
 
 
 def refine_tracks(
-    tracks: Tracks, twin: Twin, config: Config, *, condition: str | None = None, dry_run: bool = False,
-    folder: Path | None = None, progress: Progress = silent,
+    tracks: Tracks, twin: Twin, refine_config: RefineConfig, config: TracksConfig, simulator: SimulatorConfig, *,
+    condition: str | None = None, dry_run: bool = False, folder: Path | None = None, progress: Progress = silent,
 ) -> RefineResult:  # fmt: skip
     """Which effects does the model of the runs lack? Runs with ``use: hold_out`` judge them.
 
@@ -49,28 +50,26 @@ def refine_tracks(
     other conditions. folder: keeps rollouts, so that a killed run goes on. dry_run: rank the effects, fit none.
     Raises InputError if no run is held out, and for a key of refine that says nothing of tracks.
     """
-    check_effects(config.refine)
-    check_config(config)
-    settings = SearchSettings.of(config.refine, rank_only=dry_run, progress=progress)
+    check_effects(refine_config)
+    check_config(refine_config)
+    settings = SearchSettings.of(refine_config, rank_only=dry_run, progress=progress)
     with runtime.torch_threads(1):
         group = group_of(tracks)
         if group is None:
-            return _refine_body(tracks, twin, config, settings, condition, folder)
+            return _refine_body(tracks, twin, config, simulator, settings, condition, folder)
         if condition is not None:
             raise InputError("--condition is for runs of one body: bodies in flight are refined together")
         return refine_group(tracks, group, settings)
 
 
-def check_config(config: Config) -> None:
+def check_config(config: RefineConfig) -> None:
     """Raises InputError for a setting that says nothing of tracks and is not the default: it would be ignored."""
     default = RefineConfig.model_validate({})
     for key, instead in NOT_FOR_TRACKS.items():
-        if getattr(config.refine, key) != getattr(default, key):
+        if getattr(config, key) != getattr(default, key):
             raise InputError(f"refine.{key} is for scenes of pictures: leave it out, tracks have {instead}")
-    if config.refine.processes > 1:
+    if config.processes > 1:
         raise InputError("refine.processes: tracks are simulated in one process: leave it out, or give 1")
-    if config.identify.contact not in ("auto", "sticky"):
-        raise InputError(f"identify.contact: tracks know a sticky ground alone, not '{config.identify.contact}'")
 
 
 def refine_group(tracks: Tracks, group: str, settings: SearchSettings) -> RefineResult:
@@ -84,8 +83,8 @@ def refine_group(tracks: Tracks, group: str, settings: SearchSettings) -> Refine
 
 
 def _refine_body(
-    tracks: Tracks, twin: Twin, config: Config, settings: SearchSettings, condition: str | None,
-    folder: Path | None,
+    tracks: Tracks, twin: Twin, config: TracksConfig, simulator: SimulatorConfig, settings: SearchSettings,
+    condition: str | None, folder: Path | None,
 ) -> RefineResult:  # fmt: skip
     first = conditions(tracks)[0]
     condition = first if condition is None else condition
@@ -100,11 +99,11 @@ def _refine_body(
         acting = [e for e in twin.effects if e.condition is None]
         effects = tuple(e.name for e in acting)
         known = {**law, **{n: v for e in acting for n, v in effect_values(e, e.name).items()}}
-    forward_model = simulation_of(tracks, condition, config.tracks, config.simulator, known=known, folder=folder)
+    forward_model = simulation_of(tracks, condition, config, simulator, known=known, folder=folder)
     family = family_of(twin.law.kind, only_body(tracks).density or 1e3, known)
     model = Model(family, forward_model.contact, effects)
     settings.progress("refine: without effects", 0, 1)
-    base = gauss_newton_fit(forward_model, model, {**law, **start_values(twin)}, budget=config.tracks.rollouts)
+    base = gauss_newton_fit(forward_model, model, {**law, **start_values(twin)}, budget=config.rollouts)
     settings.progress("refine: without effects", 1, 1, f"{base.fit_mm:.2f} mm")
     # A smooth force for the rest would need as many rollouts as all effects together.
     result = refine(forward_model, [base], replace(settings, discrepancy_force=False), condition=condition)

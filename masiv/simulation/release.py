@@ -23,12 +23,9 @@ def simulate_release(twin: Twin, *, frames: int, fps: float) -> Rollout:
     effects = body.effects(effect_members(twin, twin.body), body.context(float(times[-1]), 1 / fps))
     _, positions = body.run(twin.law, times, effects)
     world = body.axes.points_to_world(positions.double().numpy())
-    return Rollout(
-        world.astype(np.float32),
-        times,
-        body.markers_to_world(positions),
-        tuple(twin.initial_conditions[0].release.markers),
-    )
+    release = twin.initial_conditions[0].release
+    assert release is not None  # a clamped body is let go
+    return Rollout(world.astype(np.float32), times, body.markers_to_world(positions), tuple(release.markers))
 
 
 def released_body(twin: Twin) -> MarkedBody:
