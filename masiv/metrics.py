@@ -29,7 +29,7 @@ def chamfer_1e3mm2(a: np.ndarray, b: np.ndarray, max_points: int = 8192, seed: i
 
 
 def chamfer_floor(truth: np.ndarray, max_points: int = 8192, seed: int = 0) -> float:
-    """Chamfer distance [10³ mm²] between two random samplings of the same ``truth`` (P, 3): about that of a perfect result.
+    """Chamfer distance [10³ mm²] between two random samplings of one ``truth`` (P, 3): the value of a perfect result.
 
     Two disjoint halves of the truth are compared. At full density, distances are smaller by a factor of 2^(1/3).
     """
