@@ -1,4 +1,4 @@
-"""The pull of a hull: none where Gaussians fill it, towards what they leave empty."""
+"""The loss of a hull: zero if Gaussians fill it, with a gradient towards what they leave empty."""
 
 import numpy as np
 import torch
@@ -18,20 +18,20 @@ def slab(height):
     return VisualHull(points, SPACING, ~inner), torch.tensor(means, dtype=torch.float32, requires_grad=True)
 
 
-def pulled(hull, means):
-    pull = HullLoss(hull)
-    far = pull(means, *pull.draw(len(means), 10**6, np.random.default_rng(0)))
+def loss_of(hull, means):
+    loss = HullLoss(hull)
+    far = loss(means, *loss.draw(len(means), 10**6, np.random.default_rng(0)))
     (gradient,) = torch.autograd.grad(far, [means])
     return float(far.detach()), float(gradient[:, 1].sum())
 
 
-def test_gaussians_that_fill_their_hull_are_not_pulled():
+def test_gaussians_that_fill_their_hull_have_no_loss():
     hull, means = slab(4)
-    assert pulled(hull, means) == (0.0, 0.0)
+    assert loss_of(hull, means) == (0.0, 0.0)
 
 
-def test_an_empty_part_of_a_hull_pulls():
+def test_an_empty_part_of_a_hull_attracts_gaussians():
     hull, means = slab(12)
-    far, along = pulled(hull, means)
+    far, along = loss_of(hull, means)
     assert far > SPACING
     assert along < 0  # the loss falls where Gaussians rise

@@ -126,13 +126,13 @@ def test_targets_have_the_gradient_of_chamfer():
     torch.testing.assert_close(ours, x.grad, rtol=1e-4, atol=1e-6)
 
 
-def test_a_second_sampling_of_the_same_volume_does_not_pull():
+def test_a_second_sampling_of_the_same_volume_has_no_weight():
     start = FilledVolume(lattice(), 0.1, 216e-3)
     shifted = FilledVolume(lattice() + 0.03, 0.1, 216e-3)
     assert float(chamfer_targets(lattice()[None], [shifted], start).weights.sum()) == 0
 
 
-def test_hull_that_no_camera_sees_does_not_pull():
+def test_shadow_volume_of_the_hull_has_no_weight():
     """A filled volume twice the body's: of the half that is far away, the tenth that is slack pulls and no more."""
     start = FilledVolume(lattice(), 0.1, 216e-3)
     spike = np.concatenate([lattice(), lattice() + np.array([3.0, 0, 0])])
