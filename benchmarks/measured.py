@@ -206,7 +206,7 @@ def damping(
 def load(source: Path, youngs: float, viscosity: float, particles: int, courant: float, what: list[str]) -> list[dict]:
     """The loaded beam with one effect at the middle of its end, law and viscosity known: what is left of load52_a, from
     0.1 to 0.6 s after its release, and of load52_b, which is held out."""
-    from masiv.identify.tracks import simulation_of
+    from masiv.identify.tracks import clamped_body_model
     from masiv.inference.model_fit import gauss_newton_fit
     from masiv.models.base import Model
     from masiv.models.families import family_of
@@ -223,7 +223,7 @@ def load(source: Path, youngs: float, viscosity: float, particles: int, courant:
     for name in what:
         began = time.perf_counter()
         settings = TracksConfig(particles=particles, duration=0.6)
-        simulation = simulation_of(tracks, "load52", settings, config, known=law)
+        simulation = clamped_body_model(tracks, "load52", settings, config, known=law)
         effects = ("viscosity",) if name == "nothing" else ("viscosity", name)
         values = {f"{name}.{n}": float(v) for n, v in begins[name].items()}
         held: frozenset[str] = frozenset()

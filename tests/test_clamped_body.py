@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from masiv.errors import NonFiniteError
-from masiv.identify.tracks import simulation_of
+from masiv.identify.tracks import clamped_body_model
 from masiv.models.base import Model
 from masiv.models.families import family_of
 from masiv.mpm.config import SimulatorConfig
@@ -50,7 +50,7 @@ CHANGES = {
 
 
 def model_of(tracks, folder, simulator=SIMULATOR, **known):
-    return simulation_of(tracks, "", TRACKS, simulator, known={**KNOWN, **known}, folder=folder)
+    return clamped_body_model(tracks, "", TRACKS, simulator, known={**KNOWN, **known}, folder=folder)
 
 
 @pytest.mark.parametrize("what", CHANGES)
@@ -74,7 +74,7 @@ def test_a_rollout_with_another_substep_is_not_taken_from_disk(bar, tmp_path):
     model = Model(family, "none")
 
     def fields(folder, *moduli):
-        forward = simulation_of(bar, "", TRACKS, SIMULATOR, known={"poissons_ratio": 0.2}, folder=folder)
+        forward = clamped_body_model(bar, "", TRACKS, SIMULATOR, known={"poissons_ratio": 0.2}, folder=folder)
         return [forward.fields(model, {"youngs_modulus": modulus})[0] for modulus in moduli][-1]
 
     alone, after_a_stiffer_one = fields(None, 1e5), fields(None, 3e5, 1e5)
@@ -85,7 +85,7 @@ def test_a_rollout_with_another_substep_is_not_taken_from_disk(bar, tmp_path):
 
 def test_a_law_that_is_stiffer_than_the_held_substep_allows_is_refused(bar):
     model = Model(family_of("neo_hookean", 1070, {"poissons_ratio": 0.2}), "none")
-    forward = simulation_of(bar, "", TRACKS, SIMULATOR, known={"poissons_ratio": 0.2})
+    forward = clamped_body_model(bar, "", TRACKS, SIMULATOR, known={"poissons_ratio": 0.2})
     forward.fields(model, {"youngs_modulus": 1e5})
     with pytest.raises(NonFiniteError, match="the law needs substeps of"):
         forward.fields(model, {"youngs_modulus": 1e6})

@@ -17,11 +17,10 @@ from dropped_balls import Ball, write_scene
 from small import SMALL
 
 from masiv.cli import main
-from masiv.config import Config
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
 from masiv.identify.from_tracks import described_twin
-from masiv.identify.tracks import fit_law, simulation_of
+from masiv.identify.tracks import clamped_body_model, fit_law
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.base import Model
@@ -37,7 +36,7 @@ from masiv.refine.from_tracks import refine_tracks
 from masiv.refine.search_state import SearchSettings
 from masiv.refine.stage import refine
 from masiv.refine.to_twin import refined_twin
-from masiv.simulation.fitted_twin import fitted_twin, place_of
+from masiv.simulation.fitted_twin import fitted_twin, law_values, place_of
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.read import read_tracks
 
@@ -121,7 +120,7 @@ def bar(tmp_path_factory):
 def test_damping_is_found_and_the_law_with_it(bar):
     known = {"poissons_ratio": RATIO}
     simulation = only(
-        simulation_of(bar, "", TRACKS, SIMULATOR, known=known), ("viscosity", "gravity_scale", "linear_drag")
+        clamped_body_model(bar, "", TRACKS, SIMULATOR, known=known), ("viscosity", "gravity_scale", "linear_drag")
     )
     base = fit_law(simulation, family_of("neo_hookean", 1070, known), TRACKS, quiet)
     assert base.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.15)
@@ -139,7 +138,7 @@ def test_damping_is_found_and_the_law_with_it(bar):
 @pytest.mark.slow
 def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
-    simulation = only(simulation_of(bar, "load", TRACKS, SIMULATOR, known=known), ("point_mass", "gravity_scale"))
+    simulation = only(clamped_body_model(bar, "load", TRACKS, SIMULATOR, known=known), ("point_mass", "gravity_scale"))
     family = family_of("neo_hookean", 1070, known)
     base = gauss_newton_fit(simulation, Model(family, "none", ("viscosity",)), {}, budget=4)
     assert simulation.curriculum(base.fields)  # its phase is lost
@@ -156,16 +155,13 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
 def test_one_body_from_its_law_to_its_twin(bar, tmp_path):
     """As the command does it: the law refitted with an effect, a second time from the rollouts on disk, the twin with
     what was accepted, and another condition on top of that."""
-    config = Config.model_validate({
-        "simulator": SIMULATOR.model_dump(), "tracks": TRACKS.model_dump(),
-        "refine": {"effects": ["viscosity"], "shortlist": 1, "max_effects": 1},
-    })  # fmt: skip
+    config = RefineConfig.model_validate({"effects": ["viscosity"], "shortlist": 1, "max_effects": 1})
     known = {"poissons_ratio": RATIO}
-    simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known=known)
+    simulation = clamped_body_model(bar, "", TRACKS, SIMULATOR, known=known)
     model = Model(family_of("neo_hookean", 1070, known), "none")
     base = gauss_newton_fit(simulation, model, {"youngs_modulus": YOUNGS}, budget=6)
-    twin = fitted_twin(described_twin(bar, config), base, simulation, {})
-    result = refine_tracks(bar, twin, config, folder=tmp_path)
+    twin = fitted_twin(described_twin(bar, TRACKS, SIMULATOR), base, simulation, {})
+    result = refine_tracks(bar, twin, config, TRACKS, SIMULATOR, folder=tmp_path)
     assert [t.name for t in result.accepted] == ["viscosity"]
     assert result.condition == ""
     assert result.places == {}
@@ -174,14 +170,14 @@ def test_one_body_from_its_law_to_its_twin(bar, tmp_path):
         ("own_a", ["fit"]), ("own_b", ["held_out"])
     ]  # fmt: skip
     assert set(arrays(result)) >= {"observed@own_a", "before@own_b", "after@own_b", "times@own_a"}
-    again = refine_tracks(bar, twin, config, folder=tmp_path)
+    again = refine_tracks(bar, twin, config, TRACKS, SIMULATOR, folder=tmp_path)
     assert (again.forward_model.rollouts, again.after.values) == (0, result.after.values)
     refined = refined_twin(twin, result)
     assert [(e.name, e.condition) for e in refined.effects] == [("viscosity", None)]
-    assert refined.law.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.02)
+    assert law_values(refined)["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.02)
     assert twin.effects == ()
-    load = config.model_copy(update={"refine": RefineConfig.model_validate({"effects": ["gravity_scale"]})})
-    other = refine_tracks(bar, refined, load, condition="load", dry_run=True)
+    load = RefineConfig.model_validate({"effects": ["gravity_scale"]})
+    other = refine_tracks(bar, refined, load, TRACKS, SIMULATOR, condition="load", dry_run=True)
     assert other.verdict == "ranked only"
     assert other.before.model.effects == ("viscosity",)  # what is known acts
     assert [c.effect for c in other.search.rounds[0].candidates] == ["gravity_scale"]
@@ -191,26 +187,25 @@ def test_one_body_from_its_law_to_its_twin(bar, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"refine": {"particles": 200}}, "refine.particles is for scenes of pictures: leave it out, tracks have"),
-        ({"refine": {"laws": ["newtonian"]}}, "refine.laws"),
-        ({"refine": {"tracking_error": 0.1}}, "refine.tracking_error"),
-        ({"refine": {"processes": 2}}, "tracks are simulated in one process"),
-        ({"identify": {"contact": "release"}}, "tracks know a sticky ground alone"),
-        ({"refine": {"effects": ["ether"]}}, "unknown effect 'ether'"),
+        ({"particles": 200}, "refine.particles is for scenes of pictures: leave it out, tracks have"),
+        ({"laws": ["newtonian"]}, "refine.laws"),
+        ({"tracking_error": 0.1}, "refine.tracking_error"),
+        ({"processes": 2}, "tracks are simulated in one process"),
+        ({"effects": ["ether"]}, "unknown effect 'ether'"),
     ],
 )
 def test_settings_that_say_nothing_of_tracks_are_refused(bar, settings, words):
     nothing: Any = None
     with pytest.raises(InputError, match=words):
-        refine_tracks(bar, nothing, Config.model_validate(settings))
+        refine_tracks(bar, nothing, RefineConfig.model_validate(settings), TRACKS, SIMULATOR)
 
 
 def test_a_place_is_told_in_the_body(bar):
-    simulation = simulation_of(bar, "load", TRACKS, SIMULATOR, known={"poissons_ratio": RATIO})
+    simulation = clamped_body_model(bar, "load", TRACKS, SIMULATOR, known={"poissons_ratio": RATIO})
     run = simulation.observations[0]
     tip = np.array([0.0, 0.0, 0.05])  # own axes
     placement = next(r for r in bar.runs if r.name == run.name).placement
-    x, y, z = run.body.frame.points_to_simulation(placement.to_world(tip[None]))[0]
+    x, y, z = simulation.body(run).axes.points_to_simulation(placement.to_world(tip[None]))[0]
     values = {"point_mass.x": float(x), "point_mass.y": float(y), "point_mass.z": float(z)}
     fitted: Any = SimpleNamespace(values=values)
     assert place_of(simulation, "point_mass", fitted) == pytest.approx(tuple(tip), abs=1e-9)
@@ -244,7 +239,7 @@ def test_a_static_deflection_strains_as_it_moves(bar):
 def test_what_the_first_moments_did_to_a_run_is_found_from_the_rest_of_it(bar):
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
     skipped = replace(bar, runs=tuple(replace(run, ignore_after_release=0.05) for run in bar.runs))
-    simulation = simulation_of(skipped, "", TRACKS, SIMULATOR, known=known)
+    simulation = clamped_body_model(skipped, "", TRACKS, SIMULATOR, known=known)
     run = next(r for r in simulation.observations if not r.fitted)
     assert run.times[0] >= 0.05
     model = Model(family_of("neo_hookean", 1070, known), "none", ("viscosity",))
@@ -273,7 +268,7 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
     """Out of phase, and with no first moments to count from: from none, its derivative would lead elsewhere."""
     known = {"poissons_ratio": RATIO, "youngs_modulus": YOUNGS, "viscosity.viscosity": VISCOSITY}
     fitted = tuple(replace(run, ignore_after_release=0.04) for run in bar.runs if run.purpose == "fit")
-    simulation = simulation_of(replace(bar, runs=fitted), "load", TRACKS, SIMULATOR, known=known)
+    simulation = clamped_body_model(replace(bar, runs=fitted), "load", TRACKS, SIMULATOR, known=known)
     term = simulation.term("point_mass")
     places = tuple(sorted(term.guesses, key=lambda place: place[2]))  # along the bar, from the clamp
     coarse = replace(term, guesses=(places[0], places[-1]))
@@ -292,7 +287,7 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
 
 
 def test_what_acts_on_the_matter_at_a_place_is_in_the_body(bar):
-    simulation = simulation_of(bar, "", TRACKS, SIMULATOR, known={})
+    simulation = clamped_body_model(bar, "", TRACKS, SIMULATOR, known={})
     particles = simulation.body(simulation.observations[0]).particles.numpy()
     for name in ("point_mass", "point_force"):
         for p, low, high in zip(simulation.term(name).others, particles.min(0), particles.max(0), strict=True):
@@ -352,7 +347,7 @@ def test_what_tracks_refuse(tmp_path, masiv):
     masiv("identify", tmp_path, "--out", tmp_path / "run")
     for command, words in (
         (("refine", tmp_path / "run", "--condition", "load"), "--condition is for runs of one body"),
-        (("simulate", tmp_path / "run", "--frames", 9, "--without", "swirl"), "the twin has no such effect"),
+        (("simulate", tmp_path / "run", "--frames", 9, "--without", "swirl"), "effects that act on this twin are none"),
         (("simulate", tmp_path / "run", "--frames", 9, "--render"), "--render is for scenes of pictures"),
         (("evaluate", tmp_path / "run", "--truth", tmp_path), "--truth is for scenes of pictures"),
     ):
@@ -363,4 +358,4 @@ def test_what_tracks_refuse(tmp_path, masiv):
 
 def test_unknown_condition_is_named(bar):
     with pytest.raises(InputError, match="no run of condition 'wind' to fit: its conditions are '', 'load'"):
-        simulation_of(bar, "wind", TRACKS, SIMULATOR, known={})
+        clamped_body_model(bar, "wind", TRACKS, SIMULATOR, known={})

@@ -1,4 +1,4 @@
-"""Bodies that fly free are rigid: there is nothing to fit but their starts."""
+"""Bodies in free flight move as rigid bodies: only their initial states are fitted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from masiv.models.point_mass import RIGID, PointMassModel
 def fit_flights(
     forward_model: PointMassModel, model: Model | None = None, values: Mapping[str, float] | None = None
 ) -> ModelFit:
-    """Free fall, of which only the start of each flight is fitted; or ``model``, from ``values``."""
+    """Free fall, of which only the initial state of each flight is fitted; or ``model``, from ``values``."""
     model = model or Model(RIGID, "none")
     budget = 12 * (len(forward_model.parameters(model)) + 1)
     return gauss_newton_fit(forward_model, model, values or {}, budget=budget)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from masiv.identify.from_tracks import group_of
-from masiv.identify.tracks import only_body, simulation_of
+from masiv.identify.from_tracks import flight_group
+from masiv.identify.tracks import clamped_body_model, single_body
 from masiv.models.base import Model
 from masiv.models.clamped_body import ClampedBodyModel
 from masiv.models.families import family_of
@@ -24,7 +25,7 @@ from masiv.twin import Twin
 
 @dataclass(frozen=True)
 class TwinSimulation:
-    """A twin's forward model of runs: their model with its values."""
+    """A twin as a forward model of runs: the model of the runs, and the twin's values of its parameters."""
 
     simulation: ClampedBodyModel | PointMassModel
     model: Model
@@ -38,8 +39,8 @@ class TwinSimulation:
 def simulate_runs(
     tracks: Tracks, twin: Twin, config: TracksConfig, simulator: SimulatorConfig, condition: str | None = None
 ) -> TwinSimulation:
-    """``twin`` over the runs of ``condition`` (None: the first)."""
-    group = group_of(tracks)
+    """``twin`` as a forward model of the runs of ``condition`` (None: the first)."""
+    group = flight_group(tracks)
     if group is not None:
         points = PointMassModel(tracks, flight_observations(tracks, group))
         terms = [(e, points.made(e.name, e.bodies).name) for e in twin.effects]
@@ -49,9 +50,9 @@ def simulate_runs(
         )
     twin = twin.in_condition(condition)
     law = law_values(twin)
-    simulation = simulation_of(tracks, twin.conditions[0], config, simulator, known=law)
+    simulation = clamped_body_model(tracks, twin.conditions[0], config, simulator, known=law)
     model = Model(
-        family_of(twin.law.kind, only_body(tracks).density or 1e3, law),
+        family_of(twin.law.kind, single_body(tracks).density or 1e3, law),
         simulation.contact,
         tuple(e.name for e in twin.effects),
     )
@@ -59,8 +60,8 @@ def simulate_runs(
     return TwinSimulation(simulation, model, {**start_values(twin), **values})
 
 
-def run_errors(runs: Sequence[TracksObservation], fields: Sequence[np.ndarray]) -> list[dict]:
-    """Root mean square distance of each run [mm]."""
+def run_errors(runs: Sequence[TracksObservation], fields: Sequence[np.ndarray]) -> list[dict[str, Any]]:
+    """Root mean square distance [mm] of each run, from its residuals (T, N, A) [m]."""
     return [
         {"run": run.name, "use": "fit" if run.fitted else "hold_out", "rmse_mm": rms_mm([f]), "instants": len(f)}
         for run, f in zip(runs, fields, strict=True)

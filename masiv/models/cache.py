@@ -50,7 +50,7 @@ class RolloutCache:
         else:
             found = compute()
             if file is not None:
-                write_npz(file, **found)
+                write_npz(file, compressed=False, **found)
         while len(self._kept) >= self.capacity:
             self._kept.pop(next(iter(self._kept)))
         self._kept[name] = found

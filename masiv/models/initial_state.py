@@ -39,8 +39,8 @@ class InitialState:
         cls, axes: SimulationFrame, velocity: np.ndarray, omega: np.ndarray, ground_offset: float = 0.0
     ) -> InitialState:
         """From velocity (3,) [m/s] and omega (3,) [rad/s] in the world frame."""
-        turned = (torch.as_tensor(axes.vectors_to_simulation(v), dtype=torch.float32) for v in (velocity, omega))
-        return cls(*turned, torch.tensor(ground_offset, dtype=torch.float32))
+        v, w = (torch.as_tensor(axes.vectors_to_simulation(v), dtype=torch.float32) for v in (velocity, omega))
+        return cls(v, w, torch.tensor(ground_offset, dtype=torch.float32))
 
     @classmethod
     def of_values(cls, values: Mapping[str, float]) -> InitialState:

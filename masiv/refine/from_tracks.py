@@ -7,8 +7,8 @@ from pathlib import Path
 
 from masiv import runtime
 from masiv.errors import InputError
-from masiv.identify.from_tracks import group_of
-from masiv.identify.tracks import conditions, only_body, runs_of, simulation_of
+from masiv.identify.from_tracks import flight_group
+from masiv.identify.tracks import clamped_body_model, conditions, runs_in_condition, single_body
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.base import Model
@@ -54,7 +54,7 @@ def refine_tracks(
     check_config(refine_config)
     settings = SearchSettings.of(refine_config, rank_only=dry_run, progress=progress)
     with runtime.torch_threads(1):
-        group = group_of(tracks)
+        group = flight_group(tracks)
         if group is None:
             return _refine_body(tracks, twin, config, simulator, settings, condition, folder)
         if condition is not None:
@@ -88,7 +88,7 @@ def _refine_body(
 ) -> RefineResult:  # fmt: skip
     first = conditions(tracks)[0]
     condition = first if condition is None else condition
-    if not any(run.purpose == "hold_out" for run in runs_of(tracks, condition)):
+    if not any(run.purpose == "hold_out" for run in runs_in_condition(tracks, condition)):
         raise InputError(f"{tracks.path}: no run to judge by: give one of its runs `use: hold_out`")
     law = law_values(twin)
     effects: tuple[str, ...] = ()
@@ -99,8 +99,8 @@ def _refine_body(
         acting = [e for e in twin.effects if e.condition is None]
         effects = tuple(e.name for e in acting)
         known = {**law, **{n: v for e in acting for n, v in effect_values(e, e.name).items()}}
-    forward_model = simulation_of(tracks, condition, config, simulator, known=known, folder=folder)
-    family = family_of(twin.law.kind, only_body(tracks).density or 1e3, known)
+    forward_model = clamped_body_model(tracks, condition, config, simulator, known=known, folder=folder)
+    family = family_of(twin.law.kind, single_body(tracks).density or 1e3, known)
     model = Model(family, forward_model.contact, effects)
     settings.progress("refine: without effects", 0, 1)
     base = gauss_newton_fit(forward_model, model, {**law, **start_values(twin)}, budget=config.rollouts)

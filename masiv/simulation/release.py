@@ -16,7 +16,6 @@ from masiv.twin import Twin
 def simulate_release(twin: Twin, *, frames: int, fps: float) -> Rollout:
     """``frames`` frames at k / fps [s] after the release of the only body of ``twin``. Raises InputError,
     NonFiniteError."""
-    body = released_body(twin)
     body, release = released_body(twin), twin.initial_conditions[0].release
     assert release is not None  # released_body raises otherwise
     if frames < 2:
