@@ -1,4 +1,4 @@
-"""Resumable stages: a state that is written now and then, atomically, and read back after a kill."""
+"""Resumable stages: a state that is saved from time to time, atomically, and loaded after an interruption."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from masiv.files import atomic
 
 
 class Checkpoint:
-    """The state of one stage on disk. ``Checkpoint(None)`` keeps nothing.
+    """The state of one stage on disk: tensors and plain values. ``Checkpoint(None)`` saves nothing.
 
-    A stage must draw its random numbers from (seed, iteration) alone, so that a state is only
-    tensors, optimiser state and an iteration count, and a resumed stage ends with the same numbers.
+    The random numbers of a stage must be a function of (seed, iteration), so that a resumed stage has the same result.
     """
 
     def __init__(self, path: Path | None, every_s: float = 20.0) -> None:
@@ -23,7 +22,7 @@ class Checkpoint:
         self._last = time.monotonic()
 
     def load(self) -> dict[str, Any] | None:
-        """The last state saved, or None where there is none."""
+        """The last state that was saved, or None. Raises an error of torch if the file is damaged."""
         if self.path is None or not self.path.exists():
             return None
         import torch
@@ -46,7 +45,7 @@ class Checkpoint:
         self._last = time.monotonic()
 
     def clear(self) -> None:
-        """Forget the state: the stage is done."""
+        """Remove the state, after the stage is done."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 

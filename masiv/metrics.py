@@ -1,4 +1,4 @@
-"""How far a motion or a picture is from the truth, and what a ball would have done.
+"""Errors of motions and pictures, and the baseline of a rigid body in free flight.
 
 Points are (N, 3) and motions (T, N, 3), in metres; pictures (H, W, 3) uint8, or float in [0, 1];
 masks (H, W) in [0, 1].
@@ -16,9 +16,11 @@ from masiv.scene.scene import Ground
 
 
 def chamfer_1e3mm2(a: np.ndarray, b: np.ndarray, max_points: int = 8192, seed: int = 0) -> float:
-    """Chamfer distance of two point sets [10³ mm²], as MASIV reports it: squared L2, mean, both directions summed.
+    """Chamfer distance of two point sets [10³ mm²], as in MASIV: the sum over both directions of the mean squared
+    distance to the nearest point.
 
-    At most ``max_points`` of each set, drawn from ``seed``. Two points 10 mm apart measure 0.2.
+    At most ``max_points`` of each set are used, drawn with ``seed``. Two points 10 mm apart have the distance 0.2.
+    Raises InputError if a set is empty or not finite.
     """
     first, second = (_sampled(_finite(points, "chamfer"), max_points, seed + k) for k, points in enumerate((a, b)))
     forth, _ = cKDTree(second).query(first)
@@ -27,9 +29,9 @@ def chamfer_1e3mm2(a: np.ndarray, b: np.ndarray, max_points: int = 8192, seed: i
 
 
 def chamfer_floor(truth: np.ndarray, max_points: int = 8192, seed: int = 0) -> float:
-    """What two random samplings of the same truth (P, 3) measure [10³ mm²]: a perfect answer scores about this.
+    """Chamfer distance [10³ mm²] between two random samplings of one ``truth`` (P, 3): the value of a perfect result.
 
-    Two disjoint halves of the truth are compared; at its full density points lie 2^(1/3) closer, squares 2^(2/3).
+    Two disjoint halves of the truth are compared. At full density, distances are smaller by a factor of 2^(1/3).
     """
     order = np.random.default_rng(seed).permutation(len(truth))
     half = len(truth) // 2
@@ -40,11 +42,11 @@ def chamfer_floor(truth: np.ndarray, max_points: int = 8192, seed: int = 0) -> f
 def tracked_error_mm(
     rest_points: np.ndarray, trajectory: np.ndarray, truth: np.ndarray, neighbours: int = 8
 ) -> np.ndarray:
-    """Mean distance [mm] of each frame, shape (T,), between particles' displacements and the true ones.
+    """Mean distance (T,) [mm] between the displacements of particles and the true ones, for each frame.
 
-    rest_points (Q, 3) are the particles' frame-0 positions, trajectory (T, Q, 3) their motion, truth (T, P, 3).
-    The true displacement at a rest point is the inverse-distance mean over its ``neighbours`` nearest true particles
-    at frame 0.
+    rest_points (Q, 3): positions of the particles at frame 0; trajectory (T, Q, 3): their motion; truth (T, P, 3). The
+    true displacement of a particle is the mean over its ``neighbours`` nearest true particles at frame 0, weighted by
+    inverse distance. Raises InputError if shapes do not match or values are not finite.
     """
     if trajectory.shape[0] != truth.shape[0] or trajectory.shape[1:] != rest_points.shape:
         raise InputError(
@@ -81,7 +83,7 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def mask_box(mask: np.ndarray, margin: int = 4) -> tuple[slice, slice] | None:
-    """Rows and columns of the mask's bounding box, ``margin`` pixels wider; None for an empty mask."""
+    """Rows and columns of the mask's bounding box with a margin of ``margin`` pixels; None for an empty mask."""
     rows, columns = np.flatnonzero((mask > 0.5).any(axis=1)), np.flatnonzero((mask > 0.5).any(axis=0))
     if len(rows) == 0:
         return None
@@ -92,7 +94,7 @@ def mask_box(mask: np.ndarray, margin: int = 4) -> tuple[slice, slice] | None:
 
 
 def picture_scores(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """PSNR [dB] and SSIM over the full image, and over the box of ``mask`` where it has one."""
+    """PSNR [dB] and SSIM of the full image, and of the bounding box of ``mask`` if that is not empty."""
     scores = {"psnr_db": psnr(image, reference), "ssim": ssim(image, reference)}
     box = mask_box(mask)
     if box is not None:
@@ -101,7 +103,7 @@ def picture_scores(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -
 
 
 def mask_iou(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of two masks cut at 0.5; 1 where both are empty."""
+    """Intersection over union of two masks with threshold 0.5; 1 if both are empty."""
     first, second = a > 0.5, b > 0.5
     union = int((first | second).sum())
     return 1.0 if union == 0 else float((first & second).sum() / union)
@@ -116,10 +118,10 @@ def rigid_ballistic(
     times: np.ndarray,
     ground: Ground | None = None,
 ) -> np.ndarray:
-    """The baseline that knows no material: a rigid body in free flight, shape (T, Q, 3) [m].
+    """The motion (T, Q, 3) [m] of a rigid body in free flight: a baseline without material.
 
     positions (Q, 3) [m] at t = 0, velocity (3,) [m/s] of ``centre`` (3,) [m], omega (3,) [rad/s], gravity (3,) [m/s²],
-    times (T,) [s]. With ``ground`` the body freezes when its lowest point touches it; without, it falls through.
+    times (T,) [s]. With ``ground`` the body stops when its lowest point touches it.
     """
     relative = positions - centre
 
@@ -136,7 +138,7 @@ def _contact_time(at, ground: Ground, end: float) -> float:
         return float((at(time) @ ground.normal).min()) - ground.height
 
     start = lowest(0.0)
-    floor = min(start, 0.0)  # a body that starts in the ground may rise out of it
+    floor = min(start, 0.0)  # a body that starts below the ground can rise
     grid = np.linspace(0.0, end, 257)
     below = [k for k in range(1, len(grid)) if lowest(grid[k]) < floor - 1e-9]
     if not below:

@@ -134,7 +134,10 @@ class Workers:
 
 
 def _initialize(arch: str) -> None:
-    """Limit a new process to one thread and start Taichi. torch and Taichi are imported here at the earliest."""
+    """Limit a new process to one thread and start Taichi.
+
+    The variables act on libraries that the caller's script has not imported yet, the calls on torch and Taichi.
+    """
     os.environ.update(ONE_THREAD)
     import multiprocessing.util
 

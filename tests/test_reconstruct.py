@@ -206,6 +206,14 @@ def test_a_second_process_that_dies_is_told_of_and_none_is_left(scene, monkeypat
     assert started[0].returncode is not None
 
 
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="the system does not show a process's environment")
+def test_the_second_process_keeps_the_module_path_of_this_one(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", "/of/the/user")
+    with GradientWorker() as worker:
+        environment = Path(f"/proc/{worker._process.pid}/environ").read_bytes().split(b"\0")
+    assert b"PYTHONPATH=/of/the/user" in environment
+
+
 def test_what_the_second_process_cannot_draw_is_told_of(scene):
     """Its objective alone is broken: the picture that it is given has a camera of no number."""
     nowhere = dataclasses.replace(scene.cameras[0], world_to_camera=np.full((4, 4), np.nan))
