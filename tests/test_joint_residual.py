@@ -56,6 +56,7 @@ def test_pictures_are_nearest_at_the_truth(filmed, seen):
         assert of_pictures(**changes) > 1.02 * here
 
 
+@pytest.mark.slow
 def test_paths_that_drift_are_overruled(filmed, seen):
     true = seen[0]
     drift = (DRIFT * true.times[:, None, None]).astype(np.float32)

@@ -195,11 +195,11 @@ def test_rollout_is_bit_reproducible_and_segments_do_not_change_it():
 
 def test_substeps_launched_at_once_and_one_by_one_and_in_parts_are_the_same(monkeypatch):
     start = State(*(t.float() for t in blob(200, height=0.05).tensors()))
-    law, nothing = elastic(), ActiveEffects((), None)
+    law = elastic()
     ends = []
     for serial in (10**6, 0):
         monkeypatch.setattr("masiv.mpm.taped_rollout.SERIAL_PARTICLES", serial)
-        ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], nothing).positions)
+        ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40]).positions)
     context = EffectContext(torch.tensor([0.0, -9.8, 0.0]), start.position, 0.135, 0.3, 0.08)
     no_drag = ActiveEffects(((effect_named("linear_drag"), torch.zeros(1)),), context)  # launch by launch
     ends.append(simulator(200, dtype=torch.float32).run(start, law, 40, [13, 40], no_drag).positions)

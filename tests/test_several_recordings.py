@@ -50,6 +50,7 @@ def fitted(recordings, law=None):
     return train(recordings, start, "sticky", seed=0, checkpoint=Checkpoint(None), progress=lambda *_: None)
 
 
+@pytest.mark.slow
 def test_a_law_of_two_recordings_explains_both(seen, dropped):
     both = recordings_of(seen, dropped, settings(iterations=14))
     start = fitted(recordings_of(seen, dropped, settings(iterations=0)))
