@@ -64,6 +64,11 @@ def test_pages_are_short(page):
     assert page.stat().st_size < MAX_BYTES
 
 
+@pytest.mark.parametrize("page", PAGES, ids=of)
+def test_no_merge_was_left_half_done(page):
+    assert not re.search(r"^(<{7}|={7}|>{7})( |$)", page.read_text(encoding="utf-8"), re.MULTILINE)
+
+
 def test_command_lines_parse():
     lines = {}
     for page in TODAY:
