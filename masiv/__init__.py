@@ -14,7 +14,16 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from masiv.api import estimate_trajectory, evaluate, identify, load_config, read_scene, reconstruct, simulate
+    from masiv.api import (
+        estimate_trajectory,
+        evaluate,
+        identify,
+        load_config,
+        read_scene,
+        reconstruct,
+        refine,
+        simulate,
+    )
     from masiv.config import Config
     from masiv.errors import InputError, MasivError, NonFiniteError
     from masiv.pipeline import RefineRequest, SceneRequest, SimulateRequest, open_run, reopen_run
@@ -22,7 +31,16 @@ if TYPE_CHECKING:
 
 _MODULE_OF = {
     **dict.fromkeys(
-        ("estimate_trajectory", "evaluate", "identify", "load_config", "read_scene", "reconstruct", "simulate"),
+        (
+            "estimate_trajectory",
+            "evaluate",
+            "identify",
+            "load_config",
+            "read_scene",
+            "reconstruct",
+            "refine",
+            "simulate",
+        ),
         "masiv.api",
     ),
     **dict.fromkeys(("RefineRequest", "SceneRequest", "SimulateRequest", "open_run", "reopen_run"), "masiv.pipeline"),
@@ -47,6 +65,7 @@ __all__ = [
     "open_run",
     "read_scene",
     "reconstruct",
+    "refine",
     "reopen_run",
     "simulate",
 ]

@@ -8,6 +8,7 @@ Example:
     gaussians = masiv.reconstruct(scene, config)
     trajectory = masiv.estimate_trajectory(scene, gaussians, config)
     twin = masiv.identify(scene, trajectory, config)
+    result, twin = masiv.refine(scene, twin, trajectory, config)
     rollout = masiv.simulate(twin, frames=40, gravity=(0, -1.62, 0))
 """
 
@@ -23,7 +24,7 @@ from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.config import Config, load_config
 from masiv.errors import InputError
-from masiv.observations.read import read_scene
+from masiv.observations.read import read_observation
 from masiv.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from masiv.simulation.force import ForcePulse
     from masiv.simulation.rollout import Rollout
     from masiv.splat.dynamic import DynamicGaussians
+    from masiv.tracks.tracks import Tracks
     from masiv.twin import Twin
 
 __all__ = [
@@ -41,8 +43,18 @@ __all__ = [
     "load_config",
     "read_scene",
     "reconstruct",
+    "refine",
     "simulate",
 ]
+
+
+def read_scene(path: str | Path) -> Scene | Tracks:
+    """The scene at ``path``, whatever its layout: pictures with cameras, or tracks.
+
+    Pictures are read as they are needed. Raises InputError if no layout is recognised or a file cannot be used; lesser
+    problems are in ``problems``.
+    """
+    return read_observation(path)
 
 
 def reconstruct(scene: Scene, config: Config | None = None, *, progress: Progress = silent) -> DynamicGaussians:
@@ -68,17 +80,76 @@ def estimate_trajectory(
 
 
 def identify(
-    scene: Scene, trajectory: Trajectory, config: Config | None = None, *, progress: Progress = silent
+    scene: Scene | Tracks,
+    trajectory: Trajectory | None = None,
+    config: Config | None = None,
+    *,
+    progress: Progress = silent,
 ) -> Twin:
-    """Initial velocity and constitutive law from the motion of particles, as a ``Twin``.
+    """Initial state and constitutive law from the motion of particles or markers, as a ``Twin``.
 
-    ``config.identify.law`` chooses what is fitted (a neural law by default). Raises MasivError if no law explains the
-    motion. A script needs ``if __name__ == "__main__":`` if ``config.identify.processes`` is not 1.
+    ``config.identify.law`` chooses what is fitted: a neural law by default; ``auto``, which tracks take by default, is
+    the classical law that explains the motion best. A scene of pictures needs its ``trajectory``. Raises InputError if
+    that is missing or the law needs more than tracks show, MasivError if no law explains the motion. A script needs
+    ``if __name__ == "__main__":`` if ``config.identify.processes`` is not 1.
     """
+    from masiv.tracks.tracks import Tracks
+
+    named = config is not None
+    config = _started(config)
+    if isinstance(scene, Tracks):
+        from masiv.identify.from_tracks import identify_tracks
+
+        law = config.identify.law if named else "auto"
+        return identify_tracks(scene, law, config.tracks, config.simulator, progress=progress)[0]
+    if trajectory is None:
+        raise InputError("a scene of pictures is identified from its trajectory: use estimate_trajectory")
     from masiv.identify.stage import identify as stage
 
-    config = _started(config)
     return stage(scene, trajectory, config.identify, config.simulator, seed=config.seed, progress=progress)
+
+
+def refine(
+    scene: Scene | Tracks,
+    twin: Twin,
+    trajectory: Trajectory | None = None,
+    config: Config | None = None,
+    *,
+    fit_frames: int | None = None,
+    condition: str | None = None,
+    dry_run: bool = False,
+    progress: Progress = silent,
+) -> tuple[RefineResult, Twin]:
+    """Find the effects that the model of ``twin`` lacks. Returns what was found, and the twin with accepted effects.
+
+    Pictures: ``trajectory`` covers all frames of ``scene``, of which the first ``fit_frames`` are fitted and the rest is
+    held out (the last quarter if None). Tracks: runs with ``use: hold_out`` are held out; ``condition`` chooses runs
+    of one body. dry_run: rank the effects, fit none. Raises InputError if nothing is held out or an effect is
+    unknown, MasivError if no law explains the motion.
+    """
+    from masiv.refine.to_twin import refined_twin
+    from masiv.tracks.tracks import Tracks
+
+    config = _started(config)
+    if isinstance(scene, Tracks):
+        from masiv.refine.from_tracks import refine_tracks
+
+        result = refine_tracks(
+            scene, twin, config.refine, config.tracks, config.simulator, condition=condition, dry_run=dry_run,
+            progress=progress,
+        )  # fmt: skip
+        return result, refined_twin(twin, result)
+    if trajectory is None:
+        raise InputError("a scene of pictures is refined from its trajectory: use estimate_trajectory")
+    from masiv.refine.from_video import Recording, refine_recordings, split_frames
+
+    frames = split_frames(scene.frame_count, fit_frames or scene.frame_count)
+    recording = Recording(twin.initial_conditions[0].observation, scene, trajectory, trajectory, frames)
+    start = twin.fit.get("start") or twin.fit.get("law")
+    result = refine_recordings(
+        [recording], config.identify, config.simulator, config.refine, start=start, dry_run=dry_run, progress=progress
+    )
+    return result, refined_twin(twin, result)
 
 
 def simulate(
