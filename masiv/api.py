@@ -29,6 +29,7 @@ from masiv.progress import Progress, silent
 
 if TYPE_CHECKING:
     from masiv.continuum.trajectory import Trajectory
+    from masiv.refine.result import RefineResult
     from masiv.scene.scene import Scene
     from masiv.simulation.force import ForcePulse
     from masiv.simulation.rollout import Rollout
@@ -122,8 +123,8 @@ def refine(
 ) -> tuple[RefineResult, Twin]:
     """Find the effects that the model of ``twin`` lacks. Returns what was found, and the twin with accepted effects.
 
-    Pictures: ``trajectory`` covers all frames of ``scene``, of which the first ``fit_frames`` are fitted and the rest is
-    held out (the last quarter if None). Tracks: runs with ``use: hold_out`` are held out; ``condition`` chooses runs
+    Pictures: ``trajectory`` covers all frames of ``scene``, of which the first ``fit_frames`` are fitted and the rest
+    is held out (the last quarter if None). Tracks: runs with ``use: hold_out`` are held out; ``condition`` chooses runs
     of one body. dry_run: rank the effects, fit none. Raises InputError if nothing is held out or an effect is
     unknown, MasivError if no law explains the motion.
     """
