@@ -28,13 +28,13 @@ def main():
 
     from masiv import runtime
     from masiv.config import load_config
-    from masiv.identify.stage import identify, relearn
+    from masiv.identification.stage import identify, relearn
     from masiv.materials.classical import ClassicalLaw
     from masiv.observations.motion import SampledMotion
-    from masiv.refine.config import RefineConfig
-    from masiv.refine.document import document as document_of
-    from masiv.refine.from_video import Recording, refine_recordings
-    from masiv.refine.to_twin import refined_twin
+    from masiv.refinement.config import RefineConfig
+    from masiv.refinement.document import document as document_of
+    from masiv.refinement.from_video import Recording, refine_recordings
+    from masiv.refinement.to_twin import refined_twin
 
     runtime.start("cpu")
     torch.set_num_threads(1)

@@ -31,7 +31,7 @@ from identification_table import tables
 from parameters import FAMILY, true_parameters
 
 from masiv.continuum.trajectory import Trajectory
-from masiv.identify.stage import identify
+from masiv.identification.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.metrics import chamfer_floor
 from masiv.models.initial_state import estimate_initial_motion

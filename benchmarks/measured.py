@@ -111,9 +111,9 @@ def balls(source: Path) -> dict:
     """What refine finds in the ball drops, and what one free gravity a ball would have looked like."""
     from masiv.inference.model_fit import gauss_newton_fit
     from masiv.models.base import Model
-    from masiv.refine.config import RefineConfig
-    from masiv.refine.from_tracks import refine_group
-    from masiv.refine.search_state import SearchSettings
+    from masiv.refinement.config import RefineConfig
+    from masiv.refinement.from_tracks import refine_group
+    from masiv.refinement.search_state import SearchSettings
 
     tracks = ball_scene(source)
     began = time.perf_counter()
@@ -206,7 +206,7 @@ def damping(
 def load(source: Path, youngs: float, viscosity: float, particles: int, courant: float, what: list[str]) -> list[dict]:
     """The loaded beam with one effect at the middle of its end, law and viscosity known: what is left of load52_a, from
     0.1 to 0.6 s after its release, and of load52_b, which is held out."""
-    from masiv.identify.tracks import clamped_body_model
+    from masiv.identification.tracks import clamped_body_model
     from masiv.inference.model_fit import gauss_newton_fit
     from masiv.models.base import Model
     from masiv.models.families import family_of

@@ -54,7 +54,7 @@ def fitted(run: Path, family: str, preset: str, out: Path | None) -> tuple[dict[
     from masiv import runtime
     from masiv.config import load_config
     from masiv.continuum.trajectory import Trajectory
-    from masiv.identify.stage import identify
+    from masiv.identification.stage import identify
     from masiv.observations.read import read_scene
     from masiv.runfolder import RunFolder
 

@@ -39,8 +39,8 @@ def measured(run, truth_file, second, given):
     from masiv.config import RefineConfig
     from masiv.pipeline import reopen_run
     from masiv.pipeline.refine_video import recording_of
-    from masiv.refine.document import document as document_of
-    from masiv.refine.from_video import refine_recordings
+    from masiv.refinement.document import document as document_of
+    from masiv.refinement.from_video import refine_recordings
     from masiv.twin.identified import load_identified
 
     truth = yaml.safe_load(truth_file.read_text())

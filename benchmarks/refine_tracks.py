@@ -93,12 +93,12 @@ def baseline_fits(case, config):
     from track_cases import observed
 
     from masiv.checkpoint import Checkpoint
-    from masiv.identify.config import IdentifyConfig
+    from masiv.identification.config import IdentifyConfig
     from masiv.models.free_body import FreeBodyModel
     from masiv.mpm.config import SimulatorConfig
     from masiv.observations.motion import SampledMotion
-    from masiv.refine.baselines import BaselineProblem, baselines
-    from masiv.refine.prepare import prepare
+    from masiv.refinement.baselines import BaselineProblem, baselines
+    from masiv.refinement.prepare import prepare
     from masiv.workers import Workers
 
     torch.set_num_threads(1)
@@ -135,9 +135,9 @@ def oracle_of(case, config):
 
 
 def refined(case, config):
-    from masiv.refine.rounds import similar_to_accepted
-    from masiv.refine.search_state import SearchSettings
-    from masiv.refine.stage import refine
+    from masiv.refinement.rounds import similar_to_accepted
+    from masiv.refinement.search_state import SearchSettings
+    from masiv.refinement.stage import refine
 
     began = time.time()
     simulation, observation, fits = baseline_fits(case, config)
@@ -233,7 +233,7 @@ def main():
         table(options.table, options.oracles)
         return
     from masiv import runtime
-    from masiv.refine.config import RefineConfig
+    from masiv.refinement.config import RefineConfig
 
     runtime.start("cpu")
     out = Path(options.out)

@@ -29,7 +29,7 @@ from masiv.progress import Progress, silent
 
 if TYPE_CHECKING:
     from masiv.continuum.trajectory import Trajectory
-    from masiv.refine.result import RefineResult
+    from masiv.refinement.result import RefineResult
     from masiv.scene.scene import Scene
     from masiv.simulation.force import ForcePulse
     from masiv.simulation.rollout import Rollout
@@ -99,13 +99,13 @@ def identify(
     named = config is not None
     config = _started(config)
     if isinstance(scene, Tracks):
-        from masiv.identify.from_tracks import identify_tracks
+        from masiv.identification.from_tracks import identify_tracks
 
         law = config.identify.law if named else "auto"
         return identify_tracks(scene, law, config.tracks, config.simulator, progress=progress)[0]
     if trajectory is None:
         raise InputError("a scene of pictures is identified from its trajectory: use estimate_trajectory")
-    from masiv.identify.stage import identify as stage
+    from masiv.identification.stage import identify as stage
 
     return stage(scene, trajectory, config.identify, config.simulator, seed=config.seed, progress=progress)
 
@@ -128,12 +128,12 @@ def refine(
     of one body. dry_run: rank the effects, fit none. Raises InputError if nothing is held out or an effect is
     unknown, MasivError if no law explains the motion.
     """
-    from masiv.refine.to_twin import refined_twin
+    from masiv.refinement.to_twin import refined_twin
     from masiv.tracks.tracks import Tracks
 
     config = _started(config)
     if isinstance(scene, Tracks):
-        from masiv.refine.from_tracks import refine_tracks
+        from masiv.refinement.from_tracks import refine_tracks
 
         result = refine_tracks(
             scene, twin, config.refine, config.tracks, config.simulator, condition=condition, dry_run=dry_run,
@@ -142,7 +142,7 @@ def refine(
         return result, refined_twin(twin, result)
     if trajectory is None:
         raise InputError("a scene of pictures is refined from its trajectory: use estimate_trajectory")
-    from masiv.refine.from_video import Recording, refine_recordings, split_frames
+    from masiv.refinement.from_video import Recording, refine_recordings, split_frames
 
     frames = split_frames(scene.frame_count, fit_frames or scene.frame_count)
     recording = Recording(twin.initial_conditions[0].observation, scene, trajectory, trajectory, frames)

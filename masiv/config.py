@@ -12,10 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import InputError
-from masiv.identify.config import RENAMED_STARTS, IdentifyConfig
+from masiv.identification.config import RENAMED_STARTS, IdentifyConfig
 from masiv.mpm.config import SimulatorConfig
-from masiv.refine.config import RENAMED_KEYS as REFINE_RENAMED_KEYS
-from masiv.refine.config import RefineConfig
+from masiv.refinement.config import RENAMED_KEYS as REFINE_RENAMED_KEYS
+from masiv.refinement.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
 from masiv.strict import read_yaml, validated
 from masiv.tracks.config import TracksConfig

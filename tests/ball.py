@@ -8,7 +8,7 @@ from ring_scene import ring, spheres_scene
 from small import SMALL
 
 from masiv.continuum.fill import DensityField, even_points
-from masiv.identify.losses.images import ImageTerms
+from masiv.identification.losses.images import ImageTerms
 from masiv.models.filmed_body import FilmedBody
 from masiv.scene.scene import Scene
 

@@ -10,8 +10,8 @@ import torch
 from ring_scene import look_at
 from small import SMALL
 
-from masiv.identify.config import IdentifyConfig
-from masiv.identify.losses.objective import Objective
+from masiv.identification.config import IdentifyConfig
+from masiv.identification.losses.objective import Objective
 from masiv.models.filmed_body import FilmedBody
 from masiv.scene.scene import Frame, Ground, Scene
 from masiv.simulation.simulate import simulate

@@ -11,15 +11,15 @@ from small import NODES, SMALL, SUBSTEPS
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.effects.context import EffectContext
-from masiv.identify.config import IdentifyConfig
+from masiv.identification.config import IdentifyConfig
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
-from masiv.refine.config import RefineConfig
-from masiv.refine.prepare import prepare
+from masiv.refinement.config import RefineConfig
+from masiv.refinement.prepare import prepare
 from masiv.scene.scene import Ground, Scene
 
 FPS, FRAMES, FITTED = 24.0, 14, 10

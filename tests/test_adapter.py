@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from small import NODES, SMALL, SUBSTEPS
 
 from masiv.checkpoint import Checkpoint
-from masiv.identify.config import IdentifyConfig
-from masiv.identify.stage import identify
+from masiv.identification.config import IdentifyConfig
+from masiv.identification.stage import identify
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.classical import PARAMETERS, ClassicalLaw
 from masiv.materials.load import load_law

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from masiv.errors import NonFiniteError
-from masiv.identify.tracks import clamped_body_model
+from masiv.identification.tracks import clamped_body_model
 from masiv.models.base import Model
 from masiv.models.families import family_of
 from masiv.mpm.config import SimulatorConfig

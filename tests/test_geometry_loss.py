@@ -6,8 +6,8 @@ import torch
 from cube import scene, settings
 from small import SMALL
 
-from masiv.identify.losses.geometry import chamfer_error, surface_points, trajectory_error
-from masiv.identify.stage import identify
+from masiv.identification.losses.geometry import chamfer_error, surface_points, trajectory_error
+from masiv.identification.stage import identify
 
 
 def lattice(side=7):

@@ -9,15 +9,15 @@ from small import SMALL
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
-from masiv.identify.losses.objective import Objective
-from masiv.identify.neural.starting_law import (
+from masiv.identification.losses.objective import Objective
+from masiv.identification.neural.starting_law import (
     DIVERGED,
     MAX_START_MODULUS,
     StartingLaw,
     objective_of_start,
     rank_starting_laws,
 )
-from masiv.identify.stage import identify
+from masiv.identification.stage import identify
 from masiv.materials.load import load_law
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, estimate_initial_motion

@@ -9,11 +9,11 @@ from cube import VELOCITY, noisy, scene
 from small import SMALL, only_first_quick
 
 from masiv.checkpoint import Checkpoint
-from masiv.identify.classical import shortlist
-from masiv.identify.classical.fit import FamilyFit
-from masiv.identify.classical.model_selection import rank_by_bic
-from masiv.identify.config import IdentifyConfig
-from masiv.identify.stage import identify
+from masiv.identification.classical import shortlist
+from masiv.identification.classical.fit import FamilyFit
+from masiv.identification.classical.model_selection import rank_by_bic
+from masiv.identification.config import IdentifyConfig
+from masiv.identification.stage import identify
 from masiv.inference.noise_model import effective_samples
 from masiv.materials.classical import ClassicalLaw
 from masiv.models import families

@@ -7,8 +7,8 @@ import pytest
 import torch
 from ball import ball_scene, ball_terms
 
-from masiv.identify.losses.images import ImageTerms
-from masiv.identify.losses.picture_window import particle_spacing, picture_window, render_particles, to_world
+from masiv.identification.losses.images import ImageTerms
+from masiv.identification.losses.picture_window import particle_spacing, picture_window, render_particles, to_world
 
 pytestmark = pytest.mark.usefixtures("taichi")
 

@@ -7,9 +7,9 @@ import pytest
 from cube import OMEGA, VELOCITY, Seen, objective_of
 
 from masiv.checkpoint import Checkpoint
-from masiv.identify.classical.fit import fit_all_particles, fit_family, fit_further
-from masiv.identify.classical.residuals import JointResidual
-from masiv.identify.classical.search import search_family
+from masiv.identification.classical.fit import fit_all_particles, fit_family, fit_further
+from masiv.identification.classical.residuals import JointResidual
+from masiv.identification.classical.search import search_family
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.families import FAMILIES
 from masiv.models.initial_state import InitialState, initial_state_parameters

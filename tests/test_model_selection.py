@@ -6,9 +6,9 @@ import pytest
 from cube import OMEGA, VELOCITY, objective_of, scene
 
 from masiv.checkpoint import Checkpoint
-from masiv.identify.classical import shortlist
-from masiv.identify.classical.fit import FURTHER, FamilyFit
-from masiv.identify.classical.model_selection import image_losses, rank_by_image_loss
+from masiv.identification.classical import shortlist
+from masiv.identification.classical.fit import FURTHER, FamilyFit
+from masiv.identification.classical.model_selection import image_losses, rank_by_image_loss
 from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.workers import Workers
 

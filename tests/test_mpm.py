@@ -12,7 +12,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
 from masiv.effects.context import EffectContext
 from masiv.errors import InputError, NonFiniteError
-from masiv.identify.neural.starting_law import with_scales
+from masiv.identification.neural.starting_law import with_scales
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw

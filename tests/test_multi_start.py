@@ -6,11 +6,11 @@ from small import SMALL
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.losses.objective import Objective
-from masiv.identify.neural import multi_start
-from masiv.identify.neural.starting_law import StartingLaw
-from masiv.identify.neural.training import TrainingResult
-from masiv.identify.recording import FitRecording
+from masiv.identification.losses.objective import Objective
+from masiv.identification.neural import multi_start
+from masiv.identification.neural.starting_law import StartingLaw
+from masiv.identification.neural.training import TrainingResult
+from masiv.identification.recording import FitRecording
 from masiv.materials.neural import NeuralLaw
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState

@@ -11,8 +11,8 @@ from ball import CENTRE, RADIUS, ball_scene, ball_terms
 from ring_scene import pixel_rays
 from scipy.spatial.transform import Rotation
 
-from masiv.identify.losses.particle_colors import color_correlation_loss, estimate_particle_colors
-from masiv.identify.losses.picture_window import picture_window, to_world
+from masiv.identification.losses.particle_colors import color_correlation_loss, estimate_particle_colors
+from masiv.identification.losses.picture_window import picture_window, to_world
 
 pytestmark = pytest.mark.usefixtures("taichi")
 TURN = 0.35  # [rad] between frames 0 and 1, about the vertical

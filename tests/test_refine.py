@@ -9,14 +9,14 @@ from flight import COUNT, FITTED, VELOCITY, observed, scene
 from small import SMALL
 
 from masiv.errors import InputError
-from masiv.identify.config import IdentifyConfig
+from masiv.identification.config import IdentifyConfig
 from masiv.inference.least_squares import clipped_step
 from masiv.models.parameters import Parameter
 from masiv.observations.motion import SampledMotion
 from masiv.observations.noise_floor import noise_floor
-from masiv.refine.config import RefineConfig
-from masiv.refine.document import document as document_of
-from masiv.refine.from_video import Recording, refine_recordings, split_frames
+from masiv.refinement.config import RefineConfig
+from masiv.refinement.document import document as document_of
+from masiv.refinement.from_video import Recording, refine_recordings, split_frames
 
 pytestmark = pytest.mark.usefixtures("taichi")
 

@@ -10,15 +10,15 @@ import pytest
 from small_fits import DRAG, NOISE, fit_with, noise_model
 
 from masiv.models.parameters import Parameter
-from masiv.refine.config import RefineConfig
-from masiv.refine.evidence import (
+from masiv.refinement.config import RefineConfig
+from masiv.refinement.evidence import (
     log_predictive_gain,
     simplest,
     statistical_objections,
     strength_z,
     too_little_explained,
 )
-from masiv.refine.second_effect import objections_to_pair
+from masiv.refinement.second_effect import objections_to_pair
 
 CONFIG = RefineConfig.model_validate({})
 

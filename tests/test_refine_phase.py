@@ -10,8 +10,8 @@ from masiv.inference.robust import soft_l1_mean_square
 from masiv.models.base import EffectTerm, ForwardModel, Model
 from masiv.models.parameters import Parameter
 from masiv.observations.base import Observation
-from masiv.refine.candidates import score
-from masiv.refine.effect_fit import fit_with_effect
+from masiv.refinement.candidates import score
+from masiv.refinement.effect_fit import fit_with_effect
 
 TIMES = np.linspace(0, 0.6, 60)
 BARE, LOAD = 7.7, 2.2

@@ -11,10 +11,10 @@ import torch
 from small_fits import fit_with
 
 from masiv.errors import NonFiniteError
-from masiv.refine.candidates import Candidate, Ranking
-from masiv.refine.experiment_design import INITIAL_STATES, propose
-from masiv.refine.from_video import Recording, split_frames, with_unique_names
-from masiv.refine.rounds import Round, SearchResult, Trial
+from masiv.refinement.candidates import Candidate, Ranking
+from masiv.refinement.experiment_design import INITIAL_STATES, propose
+from masiv.refinement.from_video import Recording, split_frames, with_unique_names
+from masiv.refinement.rounds import Round, SearchResult, Trial
 from masiv.scene.transforms import SimulationFrame
 
 UNUSED: Any = None

@@ -12,15 +12,15 @@ from masiv.errors import InputError, MasivError
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.models.base import Model
 from masiv.models.families import Family
-from masiv.refine.candidates import score
-from masiv.refine.config import RefineConfig
-from masiv.refine.document import document, text
-from masiv.refine.effect_fit import fit_with_effect
-from masiv.refine.rounds import Trial
-from masiv.refine.search import DISCREPANCY_FORCE, whitened_start
-from masiv.refine.search_round import could_improve
-from masiv.refine.search_state import SearchSettings
-from masiv.refine.stage import refine
+from masiv.refinement.candidates import score
+from masiv.refinement.config import RefineConfig
+from masiv.refinement.document import document, text
+from masiv.refinement.effect_fit import fit_with_effect
+from masiv.refinement.rounds import Trial
+from masiv.refinement.search import DISCREPANCY_FORCE, whitened_start
+from masiv.refinement.search_round import could_improve
+from masiv.refinement.search_state import SearchSettings
+from masiv.refinement.stage import refine
 
 DRAG, GRAVITY = {"linear_drag.strength": 0.5}, {"gravity_scale.strength": 0.4}
 
@@ -210,7 +210,7 @@ def test_the_law_that_predicts_the_motion_is_the_base():
         return replace(fitted, fields=fields, residual=residual, cost=float((residual**2).mean()))
 
     from masiv.inference.noise_model import NoiseModel
-    from masiv.refine.evidence import select_by_validation
+    from masiv.refinement.evidence import select_by_validation
 
     nearest, predicts = law("plastic", {"swirl.strength": 2e-3}), law("viscous", {"gravity_scale.strength": 3e-3})
     assert nearest.cost < predicts.cost

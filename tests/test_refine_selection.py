@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from small_fits import fit_with, noise_model
 
-from masiv.refine.answer import answer
-from masiv.refine.candidates import Candidate
-from masiv.refine.config import RefineConfig
-from masiv.refine.rounds import Trial
-from masiv.refine.selection import select
+from masiv.refinement.answer import answer
+from masiv.refinement.candidates import Candidate
+from masiv.refinement.config import RefineConfig
+from masiv.refinement.rounds import Trial
+from masiv.refinement.selection import select
 
 
 def trial(effect, fitted, held_out, count=9, passes=True):

@@ -12,10 +12,10 @@ from small import SMALL
 from masiv.checkpoint import Checkpoint
 from masiv.cli.main import run
 from masiv.errors import InputError
-from masiv.identify.neural.training import train
-from masiv.identify.neural.training_state import TrainingState
-from masiv.identify.recording import prepare_recording
-from masiv.identify.stage import identify
+from masiv.identification.neural.training import train
+from masiv.identification.neural.training_state import TrainingState
+from masiv.identification.recording import prepare_recording
+from masiv.identification.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.pretraining.pretrain import pretrained_path

@@ -8,11 +8,11 @@ from small import SMALL, only_first_quick
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
-from masiv.identify.losses.images import pictures_of_each_frame
-from masiv.identify.neural import surface_finetune
-from masiv.identify.neural.training import TrainingResult
-from masiv.identify.recording import FitRecording
-from masiv.identify.stage import identify
+from masiv.identification.losses.images import pictures_of_each_frame
+from masiv.identification.neural import surface_finetune
+from masiv.identification.neural.training import TrainingResult
+from masiv.identification.recording import FitRecording
+from masiv.identification.stage import identify
 from masiv.materials.load import load_law
 from masiv.models.initial_state import InitialState
 from masiv.pretraining.pretrain import pretrained_path

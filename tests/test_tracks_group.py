@@ -14,9 +14,9 @@ from masiv.errors import InputError
 from masiv.models.base import Model
 from masiv.models.point_mass import RIGID, PointMassModel
 from masiv.observations.tracks import flight_observations
-from masiv.refine.config import RefineConfig
-from masiv.refine.from_tracks import refine_group
-from masiv.refine.search_state import SearchSettings
+from masiv.refinement.config import RefineConfig
+from masiv.refinement.from_tracks import refine_group
+from masiv.refinement.search_state import SearchSettings
 from masiv.tracks.geometry import mean_diameter
 
 pytestmark = pytest.mark.usefixtures("taichi")

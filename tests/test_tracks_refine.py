@@ -19,8 +19,8 @@ from small import SMALL
 from masiv.cli import main
 from masiv.effects.catalogue import effect_named
 from masiv.errors import InputError
-from masiv.identify.from_tracks import described_twin
-from masiv.identify.tracks import clamped_body_model, fit_law
+from masiv.identification.from_tracks import described_twin
+from masiv.identification.tracks import clamped_body_model, fit_law
 from masiv.inference.model_fit import gauss_newton_fit
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.base import Model
@@ -28,14 +28,14 @@ from masiv.models.clamped_body import ClampedBodyModel
 from masiv.models.families import family_of
 from masiv.models.marked_body import marked_body
 from masiv.models.release import clamp_axes, static_deflection
-from masiv.refine.candidates import score
-from masiv.refine.config import RefineConfig
-from masiv.refine.document import arrays, document
-from masiv.refine.effect_fit import fit_with_effect
-from masiv.refine.from_tracks import refine_tracks
-from masiv.refine.search_state import SearchSettings
-from masiv.refine.stage import refine
-from masiv.refine.to_twin import refined_twin
+from masiv.refinement.candidates import score
+from masiv.refinement.config import RefineConfig
+from masiv.refinement.document import arrays, document
+from masiv.refinement.effect_fit import fit_with_effect
+from masiv.refinement.from_tracks import refine_tracks
+from masiv.refinement.search_state import SearchSettings
+from masiv.refinement.stage import refine
+from masiv.refinement.to_twin import refined_twin
 from masiv.simulation.fitted_twin import fitted_twin, law_values, place_of
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.read import read_tracks

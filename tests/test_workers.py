@@ -17,17 +17,17 @@ from small import SMALL
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
-from masiv.identify.classical.fit import FamilyFit
-from masiv.identify.config import IdentifyConfig
-from masiv.identify.losses.objective import Objective
-from masiv.identify.neural.starting_law import choose_starting_laws, search_cost
+from masiv.identification.classical.fit import FamilyFit
+from masiv.identification.config import IdentifyConfig
+from masiv.identification.losses.objective import Objective
+from masiv.identification.neural.starting_law import choose_starting_laws, search_cost
 from masiv.models.base import Model
 from masiv.models.families import FAMILIES
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
 from masiv.observations.motion import SampledMotion
-from masiv.refine.baselines import ALL_FRAMES_STAGE, baselines, differentiated
-from masiv.refine.tasks import map_tasks, rank
+from masiv.refinement.baselines import ALL_FRAMES_STAGE, baselines, differentiated
+from masiv.refinement.tasks import map_tasks, rank
 from masiv.workers import TaskError, Workers, process_count, unwrap
 
 pytestmark = pytest.mark.usefixtures("taichi")
@@ -214,8 +214,8 @@ def test_as_many_as_asked_or_as_there_are_cores():
 
 @pytest.mark.slow
 def test_the_start_of_a_law_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
-    monkeypatch.setattr("masiv.identify.neural.starting_law.START_MODULI", (1e4, 3e4))
-    monkeypatch.setattr("masiv.identify.neural.starting_law.SEARCHED_MATERIALS", 2)
+    monkeypatch.setattr("masiv.identification.neural.starting_law.START_MODULI", (1e4, 3e4))
+    monkeypatch.setattr("masiv.identification.neural.starting_law.SEARCHED_MATERIALS", 2)
     motion = observed({})
     motion = SampledMotion(motion.positions[:3], motion.times[:3], motion.volume)
     config = IdentifyConfig(contact="sticky", samples_per_frame=1)
@@ -250,7 +250,7 @@ def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
 
 @pytest.mark.slow
 def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
-    monkeypatch.setattr("masiv.refine.tasks.EFFECTS_PER_TASK", 1)
+    monkeypatch.setattr("masiv.refinement.tasks.EFFECTS_PER_TASK", 1)
     simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
     values = {p.name: p.start for p in simulation.parameters(model)}

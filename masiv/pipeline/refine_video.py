@@ -17,8 +17,8 @@ from masiv.scene.scene import Scene
 
 if TYPE_CHECKING:
     from masiv.pipeline.video import VideoRun
-    from masiv.refine.from_video import Recording
-    from masiv.refine.result import RefineResult
+    from masiv.refinement.from_video import Recording
+    from masiv.refinement.result import RefineResult
     from masiv.splat.dynamic import DynamicGaussians
     from masiv.twin import Twin
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Progress) -> Summary:
     """Refine the first of ``runs`` jointly with the others; writes refine.json, refine.npz, the report and, if an
     effect is accepted, the new twin and what it gives."""
-    from masiv.refine.document import text
-    from masiv.refine.from_video import refine_recordings
+    from masiv.refinement.document import text
+    from masiv.refinement.from_video import refine_recordings
     from masiv.twin.identified import load_identified
 
     first = runs[0]
@@ -51,7 +51,7 @@ def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Prog
 
 def recording_of(run: VideoRun, progress: Progress) -> Recording:
     """The motion of a run: fitted frames, and held-out frames measured in a pass of their own."""
-    from masiv.refine.from_video import Recording, split_frames
+    from masiv.refinement.from_video import Recording, split_frames
 
     trajectory = stages.load_trajectory(run.folder)
     held_out = stages.ensure_held_out_trajectory(run.folder, run.config, run.scene, progress)
@@ -62,9 +62,9 @@ def recording_of(run: VideoRun, progress: Progress) -> Recording:
 def _save(
     run: VideoRun, recording: Recording, result: RefineResult, twin: Twin, request: RefineRequest, progress: Progress
 ) -> dict[str, Any]:
-    from masiv.refine.document import document as document_of
-    from masiv.refine.document import save_arrays
-    from masiv.refine.to_twin import baseline_twin, refined_twin
+    from masiv.refinement.document import document as document_of
+    from masiv.refinement.document import save_arrays
+    from masiv.refinement.to_twin import baseline_twin, refined_twin
     from masiv.simulation.rollout import Rollout
     from masiv.simulation.simulate import simulate
     from masiv.twin.identified import IDENTIFIED_FILE, restore_identified, save_refined
@@ -100,7 +100,7 @@ def _save(
 
 
 def _relearn(run: VideoRun, twin: Twin, progress: Progress) -> Twin:
-    from masiv.identify.stage import relearn
+    from masiv.identification.stage import relearn
 
     checkpoint = run.folder.checkpoint("relearn")
     learnt = relearn(

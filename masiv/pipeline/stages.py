@@ -88,7 +88,7 @@ def ensure_trajectory(run: RunFolder, config: Config, scene: Scene, progress: Pr
 def ensure_twin(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Twin:
     """The run's twin; identifies it if it is missing."""
     runtime.start(config.arch)
-    from masiv.identify.stage import identify
+    from masiv.identification.stage import identify
     from masiv.twin import Twin
 
     if run.done("identify"):

@@ -67,7 +67,7 @@ class TracksRun(Run):
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
-        from masiv.identify.from_tracks import identify_tracks
+        from masiv.identification.from_tracks import identify_tracks
         from masiv.report.numbers import given_or_error
 
         families: list[dict[str, Any]] = []
@@ -99,9 +99,9 @@ class TracksRun(Run):
         refuse(request, ("second_run", "relearn"), "pictures", self.folder.scene_path)
         self.folder.require("identify")
         self.start()
-        from masiv.refine.document import document, save_arrays, text
-        from masiv.refine.from_tracks import refine_tracks
-        from masiv.refine.to_twin import refined_twin
+        from masiv.refinement.document import document, save_arrays, text
+        from masiv.refinement.from_tracks import refine_tracks
+        from masiv.refinement.to_twin import refined_twin
         from masiv.twin.identified import load_to_refine, save_refined
 
         first = self._conditions[0]
@@ -182,15 +182,15 @@ class TracksRun(Run):
         return Twin.load(self.path, scene=self._described_twin)
 
     def _described_twin(self) -> Twin:
-        from masiv.identify.from_tracks import described_twin
+        from masiv.identification.from_tracks import described_twin
 
         return described_twin(self.tracks, self.config.tracks, self.config.simulator)
 
     def _report(self, twin: Twin, progress: Progress) -> list[dict[str, Any]]:
         """Simulate every run with the twin, and with the one before refine if there is one; metrics.json, rollout.npz,
         report.html. Returns the errors of each run."""
-        from masiv.identify.twin_over_runs import run_errors, simulate_runs
-        from masiv.refine.document import with_scopes
+        from masiv.identification.twin_over_runs import run_errors, simulate_runs
+        from masiv.refinement.document import with_scopes
         from masiv.report.tracks import write_report
         from masiv.twin.identified import IDENTIFIED_FILE, load_identified
 

@@ -104,12 +104,12 @@ def track_case(name: str, settings: dict[str, Any], folder: Path) -> Numbers:
     from track_cases import observed
 
     from masiv import runtime
-    from masiv.identify.config import IdentifyConfig
+    from masiv.identification.config import IdentifyConfig
     from masiv.mpm.config import SimulatorConfig
     from masiv.observations.motion import SampledMotion
-    from masiv.refine.config import RefineConfig
-    from masiv.refine.document import document
-    from masiv.refine.from_video import Recording, refine_recordings
+    from masiv.refinement.config import RefineConfig
+    from masiv.refinement.document import document
+    from masiv.refinement.from_video import Recording, refine_recordings
 
     runtime.start("cpu")
     case = replace(next(c for c in cases() if c.name == name), particles=CASE_PARTICLES)

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from masiv.errors import InputError
-from masiv.refine.answer import answer, words
+from masiv.refinement.answer import answer, words
 from masiv.report import plots
 from masiv.report.page import Page, Share, number
 

@@ -1,0 +1,67 @@
+"""Surface finetune: after the fit to particle paths, a shorter one to surfaces and pictures.
+
+Paths show which part of the body went where, and guide a fit from far away. In a body that flows they drift inside,
+where no picture shows them, and a law that is fitted to them learns the drift. Surfaces, silhouettes and colors do not
+drift.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from masiv.checkpoint import Checkpoint
+from masiv.identification.losses.objective import Objective
+from masiv.identification.neural.training import TrainingResult, train
+from masiv.identification.recording import FitRecording
+from masiv.materials.neural import NeuralLaw
+from masiv.progress import Progress
+
+
+def finetune_surfaces(
+    recordings: Sequence[FitRecording],
+    trained: TrainingResult,
+    contact: str,
+    prior: NeuralLaw,
+    *,
+    seed: int,
+    checkpoint: Checkpoint,
+    progress: Progress,
+) -> tuple[TrainingResult, float, dict[str, float]]:
+    """Continue from ``trained``, a neural law, with half as many iterations on surfaces and pictures.
+
+    Returns the one of the two results with the lower image loss, its image loss, and the image errors of both.
+    """
+    path_iterations = recordings[0].objective.config.iterations
+    objectives = [r.objective.with_surface_loss(path_iterations // 2) for r in recordings]
+    surfaces = [
+        FitRecording(objective, state, objective.problem.frames)
+        for objective, state in zip(objectives, trained.initial_states, strict=True)
+    ]
+    finetuned = train(
+        surfaces, trained.law, contact, seed=seed, checkpoint=checkpoint, progress=progress, prior=prior,
+        label="identify: fit surfaces",
+    )  # fmt: skip
+    finetuned.history = [*trained.history, *((i + path_iterations, *row) for i, *row in finetuned.history)]
+    errors = {
+        name: _mean_image_errors(objectives, result, contact)
+        for name, result in (("paths", trained), ("surfaces", finetuned))
+    }
+    report = {f"silhouette_error_of_{name}": float(silhouette) for name, (silhouette, _) in errors.items()}
+    if objectives[0].images.colors is not None:
+        report |= {f"color_error_of_{name}": float(color) for name, (_, color) in errors.items()}
+    before, after = (float(objectives[0].image_loss(e)) for e in errors.values())
+    return (finetuned, after, report) if after < before else (trained, before, report)
+
+
+def _mean_image_errors(
+    objectives: Sequence[Objective], trained: TrainingResult, contact: str
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean errors () of silhouettes and colors over all recordings."""
+    errors = [
+        objective.rollout_image_errors(trained.law, state, contact)
+        for objective, state in zip(objectives, trained.initial_states, strict=True)
+    ]
+    silhouettes, colors = zip(*errors, strict=True)
+    return torch.stack(silhouettes).mean(), torch.stack(colors).mean()

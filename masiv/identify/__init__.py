@@ -1,1 +1,0 @@
-"""From a trajectory to a twin: initial velocity, ground, law. The stage is ``masiv.identify.stage.identify``."""

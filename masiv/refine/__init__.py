@@ -1,1 +1,0 @@
-"""From a residual to the effect that the model lacks. The stage is ``masiv.refine.stage.refine``."""

@@ -1,0 +1,375 @@
+"""The result of refine as files and text: refine.json, refine.npz, and lines for a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from masiv.effects.catalogue import effect_named
+from masiv.files import write_npz
+from masiv.inference.model_fit import ModelFit, split_fields
+from masiv.models.base import EffectTerm
+from masiv.models.free_body import GRID_CORRECTION
+from masiv.observations.base import rms_mm
+from masiv.refinement.answer import answer
+from masiv.refinement.candidates import Candidate
+from masiv.refinement.result import ADDED, NOTHING, BodyResult, Proposal, RefineResult, SharedFit
+from masiv.refinement.rounds import Round, Trial, similar_to_accepted
+from masiv.refinement.search import DISCREPANCY_FORCE
+
+SCHEMA = 2
+WORST_POINTS = 0.1
+"""Part of the points whose middle is the place where a residual is largest."""
+
+
+def document(result: RefineResult) -> dict[str, Any]:
+    """refine.json. ``before`` and ``after`` hold errors of the motion; pictures are added by whoever has them."""
+    before, after = result.before, result.after
+    first = result.search.rounds[0] if result.search.rounds else None
+    out = {
+        "schema": SCHEMA,
+        "condition": result.condition,
+        "verdict": result.verdict,
+        "noise_floor_mm": 1e3 * float(np.mean([e.noise_std for e in result.observations])),
+        "discretization_mm": _discretization_mm(result),
+        "grid_change": {"before": _grid_change(result, before), "after": _grid_change(result, after)},
+        "reduced_chi": {"before": result.reduced_chi(before), "after": result.reduced_chi(after)},
+        "residual_mm": {"fit": before.fit_mm, "held_out": before.held_out_mm},
+        "candidates": [_candidate(result, c, first) for c in first.candidates] if first else [],
+        "not_ranked": [_failure(result, n, why) for n, why in first.ranking.not_ranked.items()] if first else [],
+        "accepted": [_accepted(result, term, after) for term in result.accepted],
+        "discrepancy_force": _discrepancy(result),
+        "before": _errors(result, before),
+        "after": _errors(result, after),
+        "unexplained": _unexplained(result),
+        "laws": {"before": before.model.family.kind, "after": after.model.family.kind},
+        "law_parameters": {
+            p.name: {"value": after.values[p.name], "stderr": after.stderr[p.name]}
+            for p in after.model.family.parameters
+        },
+        "rounds": [_round(result, r) for r in result.search.rounds],
+        "observations": _observations(result),
+        "bodies": {name: _body(body) for name, body in result.bodies.items()},
+        "shared": [_shared(fit) for fit in result.shared],
+        "next_experiment": None if result.proposal is None else _proposal(result.proposal),
+        "rollouts": result.forward_model.rollouts,
+    }  # fmt: skip
+    return {**out, "answer": answer(out)}
+
+
+def scope_of(term: EffectTerm) -> str:
+    """Whom the term acts on, and whether they share its strength: all, each, or names."""
+    return term.name.removeprefix(term.effect).removeprefix("@") or "all"
+
+
+def _short(term: EffectTerm, name: str) -> str:
+    return name.removeprefix(f"{term.name}.")
+
+
+def _discretization_mm(result: RefineResult) -> dict[str, float | None]:
+    """By how much one grid more may differ, root mean square [mm] over the fitted and the held-out instants."""
+    parts = [(e.residual_std**2 - e.noise_std**2, e.fit_count) for e in result.observations]
+    fit = np.concatenate([variance[:count] for variance, count in parts])
+    rest = np.concatenate([variance[count:] for variance, count in parts])
+
+    def root(variance: np.ndarray) -> float | None:
+        return 1e3 * math.sqrt(max(float(variance.mean()), 0.0)) if len(variance) else None
+
+    return {"fit": root(fit), "held_out": root(rest)}
+
+
+def _grid_change(result: RefineResult, fitted: ModelFit) -> float | None:
+    """Factor of what finer grids change on average, mean over the observations; None if it was not fitted."""
+    factors = [fitted.values.get(f"{GRID_CORRECTION}@{e.name}") for e in result.observations]
+    known = [f for f in factors if f is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _candidate(result: RefineResult, candidate: Candidate, first: Round) -> dict[str, Any]:
+    term = result.forward_model.term(candidate.effect)
+    sizes = [candidate.theta[p.name] for p in term.strengths]
+    errors = [candidate.stderr[p.name] for p in term.strengths]
+    one = len(sizes) == 1
+    return {
+        "effect": term.effect,
+        "scope": scope_of(term),
+        "explained": candidate.explained,
+        "theta": sizes[0] if one else math.hypot(*sizes),
+        "unit": term.units[term.strengths[0].name],
+        "stderr": errors[0] if one else math.hypot(*errors),
+        "parameters": {_short(term, n): v for n, v in candidate.theta.items()},
+        "confusable_with": first.confusable.get(candidate.effect, []),
+        "looks_like": effect_named(term.effect).looks_like,
+    }
+
+
+def _failure(result: RefineResult, name: str, reason: str) -> dict[str, Any]:
+    term = result.forward_model.term(name)
+    return {"effect": term.effect, "scope": scope_of(term), "reason": reason}
+
+
+def _parameters(term: EffectTerm, fitted: ModelFit) -> dict[str, Any]:
+    return {
+        "theta": {_short(term, p.name): fitted.values[p.name] for p in term.parameters},
+        "stderr": {_short(term, p.name): fitted.stderr.get(p.name) for p in term.parameters},
+        "unit": {_short(term, p.name): term.units[p.name] for p in term.parameters},
+    }
+
+
+def _accepted(result: RefineResult, term: EffectTerm, fitted: ModelFit) -> dict[str, Any]:
+    place = result.places.get(term.name)
+    return {
+        "effect": term.effect,
+        "scope": scope_of(term),
+        "bodies": list(term.bodies),
+        **_parameters(term, fitted),
+        **similar_to_accepted(term.name, result.search.rounds),
+        **({} if place is None else {"place_in_body": {"value": list(place), "unit": "m"}}),
+    }
+
+
+def _discrepancy(result: RefineResult) -> dict[str, Any] | None:
+    """A smooth force for what is unexplained; in no sense a cause."""
+    fitted = result.search.discrepancy
+    if fitted is None:
+        return None
+    term = result.forward_model.term(DISCREPANCY_FORCE)
+    return {
+        "effect": DISCREPANCY_FORCE, **_parameters(term, fitted),
+        "fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm,
+    }  # fmt: skip
+
+
+def _errors(result: RefineResult, fitted: ModelFit) -> dict[str, Any]:
+    fit, rest = split_fields(fitted.fields, result.observations)
+    return {
+        "fit": {"trajectory_rmse_mm": rms_mm(fit)},
+        "held_out": {"trajectory_rmse_mm": rms_mm(rest)} if rest else {},
+    }
+
+
+def _round(result: RefineResult, done: Round) -> dict[str, Any]:
+    """The refits that competed, best first, and what could not be simulated."""
+    return {
+        "base": {"law": done.base.model.family.kind, "effects": list(done.base.model.effects)},
+        "refits": [_refit(result, done, t) for t in done.trials],
+        "not_fitted": [{**_failure(result, f.effect, f.reason), "law": f.law} for f in done.failures],
+    }
+
+
+def _refit(result: RefineResult, done: Round, trial: Trial) -> dict[str, Any]:
+    term = result.forward_model.term(trial.effect)
+    fitted = trial.fitted
+    return {
+        "law": trial.law,
+        "effect": term.effect,
+        "scope": scope_of(term),
+        "explained": trial.candidate.explained,
+        "fit_rmse_mm": fitted.fit_mm,
+        "held_out_rmse_mm": fitted.held_out_mm,
+        "parameters": {
+            _short(term, p.name): {"value": fitted.values[p.name], "stderr": fitted.stderr.get(p.name)}
+            for p in term.parameters
+        },
+        "information_gain": fitted.bic_gain(done.base),
+        "accepted": done.accepted is trial,
+        "objections": list(trial.objections),
+    }
+
+
+def _observations(result: RefineResult) -> list[dict[str, Any]]:
+    """Errors [mm] of each observation, over its fitted and its held-out instants."""
+    rows = []
+    for e, before, after in zip(result.observations, result.before.fields, result.after.fields, strict=True):
+        parts = {"fit": slice(0, e.fit_count), "held_out": slice(e.fit_count, None)}
+        seen = {name: part for name, part in parts.items() if len(before[part])}
+        rows.append({
+            "observation": e.name,
+            "instants": {name: len(before[part]) for name, part in seen.items()},
+            "before_mm": {name: rms_mm([before[part]]) for name, part in seen.items()},
+            "after_mm": {name: rms_mm([after[part]]) for name, part in seen.items()},
+        })  # fmt: skip
+    return rows
+
+
+def _unexplained(result: RefineResult) -> dict[str, Any]:
+    """What is left, and where and when it is largest."""
+    by_instant = [1e3 * np.sqrt((f**2).sum(2).mean(1)) for f in result.after.fields]
+    k = max(range(len(by_instant)), key=lambda k: float(by_instant[k].max()))
+    observation, instant = result.observations[k], int(by_instant[k].argmax())
+    by_point = (result.after.fields[k] ** 2).sum(2).mean(0)
+    weight = by_point * (by_point >= np.quantile(by_point, 1 - WORST_POINTS))
+    place = (weight[:, None] * observation.points_in_world).sum(0) / max(weight.sum(), 1e-300)
+    return {
+        "rmse_mm": rms_mm(result.after.fields),
+        "noise_floor_mm": 1e3 * observation.noise_std,
+        "worst_observation": observation.name,
+        "worst_time_s": float(observation.times[instant]),
+        "worst_instant_rmse_mm": float(by_instant[k][instant]),
+        "worst_distance_mm": 1e3 * max(float(np.linalg.norm(f, axis=2).max()) for f in result.after.fields),
+        "worst_place_at_start_m": place.tolist(),
+        "worst_place_rmse_mm": 1e3 * float(np.sqrt(by_point[weight > 0].mean())) if weight.any() else 0.0,
+        "rmse_mm_by_instant": {e.name: v.tolist() for e, v in zip(result.observations, by_instant, strict=True)},
+    }
+
+
+def _body(body: BodyResult) -> dict[str, Any]:
+    return {
+        "verdict": ADDED if body.effects else NOTHING,
+        "effects": list(body.effects),
+        "held_out_mm": {"before": body.before_mm, "after": body.after_mm},
+        "objections": list(body.objections),
+    }
+
+
+def _shared(fit: SharedFit) -> dict[str, Any]:
+    p = fit.term.parameters[0]
+    return {
+        "effect": fit.term.effect, "bodies": list(fit.term.bodies), "parameter": _short(fit.term, p.name),
+        "value": fit.fitted.values[p.name], "stderr": fit.fitted.stderr[p.name], "unit": fit.term.units[p.name],
+        "std_between_bodies": fit.strength_std, "held_out_rmse_mm": fit.fitted.held_out_mm,
+        "information_gain": fit.bic_gain,
+    }  # fmt: skip
+
+
+def _proposal(proposal: Proposal) -> dict[str, Any]:
+    def state(velocity: np.ndarray, omega: np.ndarray) -> dict[str, Any]:
+        return {
+            "initial_velocity": {"value": velocity.tolist(), "unit": "m/s"},
+            "initial_omega": {"value": omega.tolist(), "unit": "rad/s"},
+        }
+
+    return {
+        "distinguishes": list(proposal.distinguishes),
+        **state(proposal.velocity, proposal.omega),
+        "predicted_difference_mm": proposal.difference_mm,
+        "present_difference_mm": proposal.present_mm,
+        "not_simulated": [{**state(v, w), "reason": reason} for v, w, reason in proposal.not_simulated],
+    }
+
+
+# -- refine.npz ------------------------------------------------------------------------------------------------------
+
+
+def arrays(result: RefineResult) -> dict[str, Any]:
+    """refine.npz: ``observations``, their names; and of each, named ``key@observation``, ``times`` (T,) [s], ``points``
+    (N, 3) [m] at the start, ``observed``, ``before`` and ``after`` (T, N, A) [m], the last two simulated less observed,
+    and ``fit_count``, how many instants were fitted. World frame, along the A axes that were measured."""
+    out: dict[str, Any] = {"observations": np.array([e.name for e in result.observations])}
+    for e, before, after in zip(result.observations, result.before.fields, result.after.fields, strict=True):
+        own = {
+            "times": e.times,
+            "points": e.points_in_world,
+            "observed": e.values_in_world,
+            "before": e.field_in_world(before).astype(np.float32),
+            "after": e.field_in_world(after).astype(np.float32),
+            "fit_count": np.array(e.fit_count),
+        }
+        out |= {f"{key}@{e.name}": value for key, value in own.items()}
+    return out
+
+
+def save_arrays(path: Path, result: RefineResult) -> None:
+    """Write ``arrays``, completely or not at all."""
+    write_npz(path, **arrays(result))
+
+
+# -- for people ------------------------------------------------------------------------------------------------------
+
+
+def with_scopes(document: Mapping[str, Any]) -> dict[str, Any]:
+    """``document`` with effects named by whom they act on, too, for people."""
+
+    def named(row: Mapping[str, Any]) -> dict[str, Any]:
+        scope = row.get("scope") or "all"
+        return dict(row) if scope == "all" else {**row, "effect": f"{row['effect']} ({scope})"}
+
+    rounds = [{**r, "refits": [named(t) for t in r["refits"]]} for r in document["rounds"]]
+    return {
+        **document,
+        "candidates": [named(c) for c in document["candidates"]],
+        "accepted": [named(a) for a in document["accepted"]],
+        "rounds": rounds,
+    }
+
+
+def text(document: Mapping[str, Any]) -> str:
+    """The document for a terminal."""
+    shown = with_scopes(document)
+    before, after = shown["before"], shown["after"]
+    lines = [
+        f"noise floor {shown['noise_floor_mm']:.1f} mm, a finer grid would change "
+        f"{shown['discretization_mm']['fit'] or 0.0:.1f} mm; residual {shown['residual_mm']['fit']:.1f} mm fitted"
+        + _held(shown["residual_mm"]["held_out"])
+    ]
+    for c in shown["candidates"][:6]:
+        lines.append(
+            f"  {c['effect']:20s} explains {100 * c['explained']:3.0f} %  {c['theta']:.3g} {c['unit']}"
+            + _looks_like(c["confusable_with"])
+        )
+    lines += [f"  {c['effect']:20s} not ranked: {c['reason']}" for c in shown["not_ranked"]]
+    for done in shown["rounds"]:
+        lines += [_refit_line(r) for r in done["refits"]]
+        lines += [f"  refit {f['effect']} ({f['law']}): {f['reason']}" for f in done["not_fitted"]]
+    for a in shown["accepted"]:
+        values = ", ".join(f"{n} {v:.4g}{_plus_minus(a['stderr'][n])} {a['unit'][n]}" for n, v in a["theta"].items())
+        lines.append(f"{a['effect']}: {values}" + _looks_like(a["confusable_with"]))
+    lines.append(
+        f"before {before['fit']['trajectory_rmse_mm']:.1f} mm{_held(before['held_out'].get('trajectory_rmse_mm'))}, "
+        f"after {after['fit']['trajectory_rmse_mm']:.1f} mm{_held(after['held_out'].get('trajectory_rmse_mm'))}"
+    )
+    force = shown["discrepancy_force"]
+    if force is not None:
+        lines.append(
+            f"a smooth force without a known cause would leave {force['fit_rmse_mm']:.1f} mm"
+            f"{_held(force['held_out_rmse_mm'])}: it stands in for the discrepancy and explains nothing"
+        )
+    lines += _several_bodies(shown["bodies"], shown["shared"])
+    n = shown["next_experiment"]
+    if n is not None:
+        lines.append(
+            f"{' and '.join(n['distinguishes'])} look alike here; an initial velocity of "
+            f"{_vector(n['initial_velocity'])} m/s with a spin of {_vector(n['initial_omega'])} rad/s would set them "
+            f"{n['predicted_difference_mm']:.0f} mm apart"
+        )
+    return "\n".join([*lines, answer(shown)])
+
+
+def _refit_line(row: Mapping[str, Any]) -> str:
+    outcome = "accepted" if row["accepted"] else "; ".join(row["objections"]) or "another was better"
+    errors = f"{row['fit_rmse_mm']:.1f} mm{_held(row['held_out_rmse_mm'])}"
+    return f"  refit {row['effect']} ({row['law']}): {errors}: {outcome}"
+
+
+def _several_bodies(bodies: Mapping[str, Any], shared: Sequence[Mapping[str, Any]]) -> list[str]:
+    lines = []
+    for name, row in bodies.items():
+        held = row["held_out_mm"]
+        what = ", ".join(row["effects"]) or row["verdict"]
+        lines.append(f"  {name:24s} {what:28s} held out {held['before']:.0f} -> {held['after']:.0f} mm")
+    for row in shared:
+        lines.append(
+            f"one {row['parameter'].replace('_', ' ')} for {', '.join(row['bodies'])}: {row['value']:.3g} ± "
+            f"{row['stderr']:.2g} {row['unit']}, standard deviation between them {row['std_between_bodies']:.2g}"
+        )
+    return lines
+
+
+def _looks_like(others: Sequence[str]) -> str:
+    return f"  (looks like {', '.join(others)})" if others else ""
+
+
+def _held(value: float | None) -> str:
+    return "" if value is None else f", {value:.1f} mm held out"
+
+
+def _vector(quantity: Mapping[str, Any]) -> str:
+    return "(" + ", ".join(f"{v:.1f}" for v in quantity["value"]) + ")"
+
+
+def _plus_minus(error: float | None) -> str:
+    return "" if error is None else f" ± {error:.2g}"

@@ -1,0 +1,81 @@
+"""Which initial state would distinguish two explanations?"""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+
+from masiv.errors import NonFiniteError
+from masiv.inference.model_fit import ModelFit, rank_by_bic
+from masiv.models.free_body import FreeBodyModel
+from masiv.progress import Progress
+from masiv.refinement.result import Proposal
+from masiv.refinement.rounds import MIN_BIC_GAP, Round, SearchResult
+
+INITIAL_STATES = (
+    ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((3.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0)),
+    ((-3.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 3.0, 0.0), (0.0, 0.0, 0.0)), ((2.0, 2.0, 0.0), (0.0, 0.0, 0.0)),
+    ((0.0, -3.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 1.0, 0.0), (0.0, 10.0, 0.0)), ((0.0, 1.0, 0.0), (10.0, 0.0, 0.0)),
+    ((0.0, 1.0, 0.0), (0.0, 0.0, 10.0)),
+)  # fmt: skip
+"""Velocities [m/s] and spins [rad/s] that a person could give a body by hand, simulation frame (y up)."""
+
+
+def propose(search: SearchResult, progress: Progress) -> Proposal | None:
+    """The initial state for which the first accepted effect and its closest rival differ most. None if nothing was
+    accepted, if the data distinguishes the two, and if the rollouts of all initial states diverge."""
+    first = search.rounds[0] if search.rounds else None
+    if first is None or first.accepted is None:
+        return None
+    best = first.accepted.fitted
+    rival = _rival(first, best)
+    if rival is None:
+        return None
+    forward_model = cast(FreeBodyModel, search.forward_model)
+    observation = forward_model.observations[0]
+    body = forward_model.setups[0].body
+    axes, suffix = body.axes, f"@{observation.name}"
+
+    def difference_mm(state: dict[str, float]) -> float:
+        a, b = (forward_model.positions(f.model, {**f.values, **state}, 0, body.frames) for f in (best, rival))
+        return 1e3 * float((a - b).square().sum(2).mean().sqrt())
+
+    differences, failures = [], []
+    for done, (velocity, omega) in enumerate(INITIAL_STATES):
+        progress("refine: propose an initial state", done, len(INITIAL_STATES))
+        state = {f"velocity_{a}{suffix}": v for a, v in zip("xyz", velocity, strict=True)}
+        state |= {f"omega_{a}{suffix}": v for a, v in zip("xyz", omega, strict=True)}
+        try:
+            differences.append((difference_mm(state), velocity, omega))
+        except NonFiniteError as error:
+            world = (axes.vectors_to_world(np.array(v)) for v in (velocity, omega))
+            failures.append((*world, error.detail))
+    progress("refine: propose an initial state", len(INITIAL_STATES), len(INITIAL_STATES))
+    if not differences:
+        return None
+    try:
+        present = difference_mm({})
+    except NonFiniteError:
+        present = None
+    difference, velocity, omega = max(differences)
+    return Proposal(
+        (best.model.effects[-1], rival.model.effects[-1]),
+        axes.vectors_to_world(np.array(velocity)),
+        axes.vectors_to_world(np.array(omega)),
+        difference,
+        present,
+        tuple(failures),
+    )
+
+
+def _rival(first: Round, best: ModelFit) -> ModelFit | None:
+    """What may be there in place of the accepted effect, or else the best other refit of its round, if the data hardly
+    distinguishes them."""
+    rivals = rank_by_bic([t.fitted for t in first.trials if t.fitted.model.effects != best.model.effects])
+    equal = [f for f in rivals if f.model.effects[-1] in first.indistinguishable_from]
+    if equal or not rivals:
+        return equal[0] if equal else None
+    rival = rivals[0]
+    similar = rival.model.effects[-1] in first.confusable.get(best.model.effects[-1], [])
+    return rival if similar or best.bic_gain(rival) < MIN_BIC_GAP else None

@@ -1,0 +1,117 @@
+"""The result of refine: what was looked for, what was accepted and what stays unexplained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from masiv.inference.model_fit import ModelFit
+from masiv.inference.noise_model import NoiseModel
+from masiv.models.base import EffectTerm, ForwardModel
+from masiv.observations.base import Observation
+from masiv.refinement.config import RefineConfig
+from masiv.refinement.rounds import SearchResult
+
+ADDED, NOTHING, UNEXPLAINED, RANKED = "effect added", "nothing missing", "unexplained residual", "ranked only"
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The initial state to film next. velocity (3,) [m/s] and omega (3,) [rad/s], world, for which the models of the
+    two effects ``distinguishes`` differ most: by ``difference_mm``, root mean square over points and instants; by
+    ``present_mm`` in the motion that was filmed. not_simulated: velocity, omega and reason of initial states whose
+    rollouts diverge."""
+
+    distinguishes: tuple[str, str]
+    velocity: np.ndarray
+    omega: np.ndarray
+    difference_mm: float
+    present_mm: float | None
+    not_simulated: tuple[tuple[np.ndarray, np.ndarray, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class BodyResult:
+    """Of one of several bodies: its effects, errors [mm] of its held-out observations, and the objections to an effect
+    that was accepted for all bodies with one strength each."""
+
+    effects: tuple[str, ...]
+    before_mm: float
+    after_mm: float
+    objections: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SharedFit:
+    """An effect that several bodies have, fitted with one strength for them all. bic_gain: how much lower the
+    information criterion is than with one strength each (negative: the data asks for one each). strength_std: standard
+    deviation between the bodies with one strength each, in the strength's unit."""
+
+    term: EffectTerm
+    fitted: ModelFit
+    bic_gain: float
+    strength_std: float
+
+
+@dataclass(frozen=True)
+class RefineResult:
+    """search: fits and rounds. ranked_only: effects were ranked and none was fitted. condition: of the observations, of
+    tracks of one body. places: by effect, its place in the body's own axes [m]. bodies, shared: of several bodies."""
+
+    search: SearchResult
+    config: RefineConfig
+    ranked_only: bool = False
+    proposal: Proposal | None = None
+    condition: str | None = None
+    places: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    bodies: Mapping[str, BodyResult] = field(default_factory=dict)
+    shared: tuple[SharedFit, ...] = ()
+
+    @property
+    def forward_model(self) -> ForwardModel:
+        """With the observations, as whitened at the end, that all fits are compared with."""
+        return self.search.forward_model
+
+    @property
+    def observations(self) -> Sequence[Observation]:
+        return self.forward_model.observations
+
+    @property
+    def before(self) -> ModelFit:
+        return self.search.before
+
+    @property
+    def after(self) -> ModelFit:
+        return self.search.after
+
+    @property
+    def accepted(self) -> tuple[EffectTerm, ...]:
+        """The terms that were added."""
+        known = self.before.model.effects
+        return tuple(self.forward_model.term(n) for n in self.after.model.effects if n not in known)
+
+    def reduced_chi(self, fitted: ModelFit) -> float:
+        """See ``NoiseModel.reduced_chi``."""
+        return NoiseModel(self.observations).reduced_chi(fitted.squares)
+
+    @property
+    def verdict(self) -> str:
+        """ "unexplained residual" if more is left than noise and discretization explain, whether an effect was added or
+        not; else "effect added" or "nothing missing"; "ranked only" if none was fitted."""
+        if self.ranked_only:
+            return RANKED
+        if self.reduced_chi(self.after) > self.config.max_reduced_chi:
+            return UNEXPLAINED
+        return ADDED if self.accepted else NOTHING
+
+    @property
+    def changes_twin(self) -> bool:
+        """Whether a twin gets anything: an effect, or a force for the discrepancy."""
+        return not self.ranked_only and (bool(self.accepted) or self.search.discrepancy is not None)
+
+    @property
+    def twin_fit(self) -> ModelFit:
+        """The fit that a twin is made of: with the force for the discrepancy if there is one."""
+        return self.search.discrepancy or self.after

@@ -1,0 +1,91 @@
+"""What a search is given, and how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from masiv.inference.discretization import with_residual_std
+from masiv.inference.model_fit import ModelFit, warm_started_fit
+from masiv.inference.noise_model import NoiseModel
+from masiv.models.base import ForwardModel, Model
+from masiv.progress import Progress, silent
+from masiv.refinement.config import RefineConfig
+from masiv.workers import Workers
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """config: thresholds; max_effects, shortlist, search_second_effect: see ``RefineConfig``, whose values they have
+    unless given. rank_only: rank the effects, fit none. discrepancy_force: if much stays unexplained, fit a smooth
+    force for it."""
+
+    config: RefineConfig
+    max_effects: int
+    shortlist: int
+    search_second_effect: bool
+    rank_only: bool = False
+    discrepancy_force: bool = True
+    workers: Workers = field(default_factory=Workers)
+    progress: Progress = silent
+
+    @classmethod
+    def of(
+        cls, config: RefineConfig, *, rank_only: bool = False, discrepancy_force: bool = True,
+        workers: Workers | None = None, progress: Progress = silent,
+    ) -> SearchSettings:  # fmt: skip
+        """As ``config`` has them."""
+        return cls(
+            config, config.max_effects, config.shortlist, config.search_second_effect, rank_only, discrepancy_force,
+            workers or Workers(), progress,
+        )  # fmt: skip
+
+    def considered(self, forward_model: ForwardModel, model: Model) -> list[str]:
+        """Terms that may be added to ``model``, of the effects that the configuration names, in its order."""
+        names = forward_model.candidates(model)
+        wanted = self.config.effects
+        if not wanted:
+            return list(names)
+        own = [(wanted.index(e), n) for n in names if (e := forward_model.term(n).effect) in wanted]
+        return [name for _, name in sorted(own, key=lambda pair: pair[0])]
+
+
+@dataclass(frozen=True)
+class SearchState:
+    """A fit, and the forward model with whose observations it is compared. observation_std: of each observation (T,)
+    [m], the part of ``residual_std`` that is measurement. robust_scale [m]: whitened residuals above it are
+    outliers."""
+
+    forward_model: ForwardModel
+    fit: ModelFit
+    observation_std: Sequence[np.ndarray]
+    robust_scale: float
+
+    @property
+    def noise(self) -> NoiseModel:
+        return NoiseModel(self.forward_model.observations)
+
+    @property
+    def reduced_chi(self) -> float:
+        """See ``NoiseModel.reduced_chi``."""
+        return self.noise.reduced_chi(self.fit.squares)
+
+    def with_fit(self, fit: ModelFit) -> SearchState:
+        return replace(self, fit=fit)
+
+    def whitened_again(self) -> SearchState:
+        """With ``residual_std`` as ``fit`` moves, and ``fit`` refitted if that changes it: with an effect the body may
+        touch what it did not, earlier than before, and what a finer grid changes is another. Raises NonFiniteError."""
+        updated = with_residual_std(self.forward_model, self.fit, self.observation_std)
+        if same_residual_std(updated, self.forward_model):
+            return replace(self, forward_model=updated)
+        fit = warm_started_fit(updated, self.fit, self.robust_scale)
+        return replace(self, forward_model=updated, fit=fit)
+
+
+def same_residual_std(one: ForwardModel, other: ForwardModel) -> bool:
+    """Whether two forward models whiten alike."""
+    pairs = zip(one.observations, other.observations, strict=True)
+    return all(np.array_equal(a.residual_std, b.residual_std) for a, b in pairs)
