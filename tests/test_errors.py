@@ -18,7 +18,7 @@ from masiv.config import RENAMED_KEYS, Config
 from masiv.errors import InputError, MasivError, NonFiniteError
 
 SECTIONS = [name for name, value in Config() if isinstance(value, BaseModel)]
-KEY = re.compile(rf"(?<![\w./])(?:{'|'.join(SECTIONS)})\.[a-z]\w*")
+KEY = re.compile(rf"(?<![\w./])(?:{'|'.join(SECTIONS)})\.[a-z]\w*\b(?!\.[a-z])")
 FILES = re.compile(r"\.(json|npz|yaml|pt|html)$")
 
 
