@@ -56,7 +56,7 @@ def command(function: Callable[..., tuple[dict[str, Any], str]]) -> Callable[...
 
 
 def fail(message: str, code: int, as_json: bool) -> None:
-    """Say what went wrong, in one sentence, and exit with ``code``."""
+    """Print what went wrong, in one sentence, and exit with ``code``."""
     print(f"error: {message}", file=sys.stderr)
     if as_json:
         print(json.dumps({"error": message}))

@@ -22,7 +22,7 @@ def evaluate(
     seed: SeedOption = None,
     as_json: JsonOption = False,
 ) -> tuple[dict[str, Any], str]:
-    """Chamfer, tracked error, PSNR and SSIM beside rigid baselines; evaluate.json in the run folder.
+    """Chamfer, tracked error, PSNR and SSIM, with rigid baselines; evaluate.json in the run folder.
 
     Example: `masiv evaluate runs/bunny --truth scenes/bunny/gt`
 

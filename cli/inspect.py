@@ -21,7 +21,7 @@ def inspect(
     seed: SeedOption = None,
     as_json: JsonOption = False,
 ) -> tuple[dict[str, Any], str]:
-    """Say what was read: cameras or markers, frames, units, up axis, masks, problems; and draw it.
+    """Show what was read: cameras or markers, frames, units, up axis, masks, problems; and draw it.
 
     Example: `masiv inspect scenes/bunny --out bunny.png`
     """

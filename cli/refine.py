@@ -14,18 +14,20 @@ def refine(
     run: RunArgument,
     second: Annotated[
         Path | None,
-        typer.Option("--second-run", help="Another throw of the same object: fitted jointly, and held out as well."),
+        typer.Option(
+            "--second-run", help="Another recording of the same object: fitted jointly, and held out as well."
+        ),
     ] = None,
     group: Annotated[
         bool, typer.Option("--group", help="Tracks: bodies in flight that share physics, refined together.")
     ] = False,
     condition: Annotated[
-        str | None, typer.Option("--condition", help="Tracks: what do the runs of this condition lack besides?")
+        str | None, typer.Option("--condition", help="Tracks: refine the runs of this condition.")
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Rank the effects, fit none; changes no twin.")] = False,
     relearn: Annotated[
         bool,
-        typer.Option("--relearn", help="Learn the neural law anew beside the effects. [default: the classical law]"),
+        typer.Option("--relearn", help="Learn the neural law again with the effects. [default: the classical law]"),
     ] = False,
     config: ConfigOption = None,
     preset: PresetOption = None,

@@ -56,7 +56,9 @@ def simulate(
     seed: SeedOption = None,
     as_json: JsonOption = False,
 ) -> tuple[dict[str, Any], str]:
-    """Throw the twin anew: rollout.npz, and pictures with --render. What is not given is as identified.
+    """Simulate the twin from another initial state or in other conditions: rollout.npz, and pictures with --render.
+
+    What is not given is as identified.
 
     Example: `masiv simulate runs/bunny --frames 32 --velocity=1,2,0 --gravity=0,-1.6,0 --out moon --render`
 

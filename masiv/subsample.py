@@ -17,8 +17,8 @@ def kd_tree_subset(points: np.ndarray, count: int) -> np.ndarray:
     the body is cut across its longest side into halves of as many points, these again, down to ``count`` parts (a k-d
     tree), and the point nearest to the mean of each is taken.
 
-    Points that are drawn at random are another body: 800 of 4000 have their centre of mass millimetres beside it and
-    turn about other axes, which no law or throw makes up for.
+    Points that are drawn at random are another body: 800 of 4000 have their centre of mass millimetres away and
+    turn about other axes, which no law or initial state makes up for.
     """
     if count >= len(points):
         return np.arange(len(points))

@@ -72,7 +72,9 @@ def test_the_law_is_the_simplest_that_predicts_the_motion():
 def test_the_answer_says_what_the_motion_does_not_tell():
     accepted = [{"effect": "linear_drag", "indistinguishable_from": ["quadratic_drag"]}]
     document = {"verdict": "effect added", "accepted": accepted}
-    assert answer(document) == "effect added: one of linear drag, quadratic drag (this motion does not tell which)"
+    assert (
+        answer(document) == "effect added: one of linear drag, quadratic drag (this motion does not distinguish them)"
+    )
     assert answer(document | {"accepted": [{"effect": "swirl"}]}) == "effect added: swirl"
     assert answer(document | {"verdict": "nothing missing", "accepted": []}) == "nothing missing"
     unexplained = {"verdict": "unexplained residual", "accepted": [{"effect": "hidden_obstacle"}]}

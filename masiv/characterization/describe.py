@@ -172,7 +172,7 @@ def paragraph(material: Material | dict[str, Any]) -> str:
     seen = material.excited
     text = [
         f"Material: {material.behaviour}. {'; '.join(numbers)}.",
-        f"Nearest classical law: {best.kind} ({values}), misfit {best.misfit_percent:.1f} %; others: {others}.",
+        f"Nearest classical law: {best.kind} ({values}), residual {best.misfit_percent:.1f} %; others: {others}.",
         f"Observed: strains up to {100 * seen.strain[1]:.0f} %, elastic up to {100 * seen.elastic_strain[1]:.1f} %, "
         f"volume {100 * math.expm1(seen.log_volume[0]):+.1f} to {100 * math.expm1(seen.log_volume[1]):+.1f} %, "
         f"strain rates up to {seen.rate:.2g}/s.",

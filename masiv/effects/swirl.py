@@ -36,7 +36,7 @@ class Swirl(NodalEffect):
     r"""$\dot v = \theta\, e_y \times (x - c)$: spins the body up at $\theta$ rad/s^2 and carries it around the axis."""
 
     name = "swirl"
-    looks_like = "the body turns about the vertical faster and faster, or slower and slower, and is carried round"
+    looks_like = "the body turns about the vertical faster and faster, or slower and slower, and moves round"
     parameters = (
         EffectParameter("strength", "1/s^2", -100.0, 100.0, 0.05),
         EffectParameter("x", "m", -100.0, 100.0, 0.02),

@@ -188,7 +188,7 @@ def gauss_newton(
 
     A NonFiniteError of the residual refuses the step. max_evaluations: calls of the residual in all; at least one
     residual and one Jacobian are taken. robust: least ``soft_l1_sum``, its scale the standard deviation that the median
-    at the start tells; the covariance is then that of the reweighted problem. tolerance: the fit also ends if a step
+    at the start gives; the covariance is then that of the reweighted problem. tolerance: the fit also ends if a step
     lowers the cost by less than this part of it.
     Raises NonFiniteError if the start itself diverges, MasivError if the simulation diverges all around a point.
     """

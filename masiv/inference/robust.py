@@ -9,7 +9,7 @@ import numpy as np
 NORMAL_MAD = 1.4826
 """Standard deviation of a normal variable over its median absolute value."""
 OUTLIER_SIGMAS = 2.0
-"""Robust scale over the standard deviation that the median tells."""
+"""Robust scale over the standard deviation estimated from the median."""
 
 
 def robust_scale_of(residual: np.ndarray) -> float:

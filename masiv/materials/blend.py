@@ -69,8 +69,8 @@ class BlendedLaw(Law):
         parts = []
         for law, log_rate in zip((self.first, self.second), own, strict=True):
             shape, volume = torch.exp((_at_least_one(blended) - _at_least_one(log_rate)).clamp_max(0)).unbind(1)
-            carried = invariants * torch.stack([volume, shape**2, shape**2], dim=1)
-            parts.append(law.moduli(carried) * torch.stack([shape, shape, volume, shape**2], dim=1))
+            scaled = invariants * torch.stack([volume, shape**2, shape**2], dim=1)
+            parts.append(law.moduli(scaled) * torch.stack([shape, shape, volume, shape**2], dim=1))
         return (1 - self.weight) * parts[0] + self.weight * parts[1]
 
     def flow_share(self, invariants: torch.Tensor, dt: float) -> torch.Tensor:

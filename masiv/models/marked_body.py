@@ -25,7 +25,7 @@ from masiv.tracks.placement import Placement
 from masiv.tracks.tracks import Clamp, Run, Tracks
 
 TILT_WEIGHT = 1e-3
-"""Of the rotation's trace beside the height of y, so that equal choices of axes are decided."""
+"""Weight of the rotation's trace relative to the height of y: it decides between equal choices of axes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class MarkedBody(DeformableBody):
         return clamp_axes(self.gravity, self.normals)
 
     def released(self, dtype: torch.dtype = torch.float32, deflection: float = 0.0) -> State:
-        """State at the release: at rest. It is stress-free if ``deflection`` [m] is 0, else bent as by its weight."""
+        """State at the release: at rest. Stress-free if ``deflection`` [m] is 0, else deflected as by its weight."""
         x = self.particles.double()
         gradient = torch.eye(3, dtype=x.dtype).expand(len(x), 3, 3)
         axes = self.clamp_axes

@@ -1,4 +1,4 @@
-"""How a body with markers begins to move: let go at rest, perhaps bent by its own weight.
+"""How a body with markers begins to move: let go at rest, perhaps deflected by its own weight.
 
 The parameters of a release are found from the motion of the run itself, since a reader knows the instant to a few
 milliseconds only.

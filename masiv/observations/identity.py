@@ -1,4 +1,4 @@
-"""Content hashes: what tells two observations, bodies or rollouts apart. Light: no torch, no taichi."""
+"""Content hashes: what distinguishes observations, bodies and rollouts. Light: no torch, no taichi."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _update(digest: Any, value: Any, digits: int | None) -> None:
 
 
 def identity(source: Scene | Tracks) -> dict[str, Any]:
-    """What tells one scene from another, as plain values: numbers that people can compare, and digests of the rest.
+    """What distinguishes scenes, as plain values: numbers that people can compare, and digests of the rest.
 
     Of tracks everything counts but the folder: data, geometry, mass, clamp, placement, medium, gravity. Of a video, the
     first and the last picture stand for all of them.

@@ -15,10 +15,10 @@ def noise_floor(positions: np.ndarray, last_frame: int) -> float:
     """Root mean square distance [m] of observed positions (T, N, 3) [m] from the best rigid motion of each frame
     1…last_frame-1 of free flight.
 
-    A body at rest within that is thrown stays rigid until it touches something, whatever drag or wind does to it: what
-    is not rigid is the error of the observation. Not so a strain that is the same everywhere and much larger than what
-    else is not rigid: that is a body which swells or swings. Rigid errors are not seen; with errors that are smooth
-    over the body they are taken to be as large again. Where the body touches at once, frame 1 has to do.
+    A body without internal motion stays rigid in free flight, also under drag or wind. So what is not rigid is the
+    error of the observation. The exception is a uniform strain that is much larger than the rest: the body itself
+    swells or vibrates. Rigid errors cannot be seen; errors that are smooth over the body are assumed to have as large a
+    rigid part. If the body touches the ground at once, frame 1 is used.
     """
     flight = positions[: max(2, last_frame)]
     rigid, uniform = beyond_rigid(flight), beyond_uniform(flight)

@@ -19,7 +19,7 @@ def _with_others(entry: Mapping[str, Any]) -> str:
     others = entry.get("indistinguishable_from")
     if not others:
         return words(entry["effect"])
-    return f"one of {', '.join(map(words, [entry['effect'], *others]))} (this motion does not tell which)"
+    return f"one of {', '.join(map(words, [entry['effect'], *others]))} (this motion does not distinguish them)"
 
 
 def words(name: str) -> str:

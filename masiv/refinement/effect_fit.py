@@ -34,7 +34,7 @@ MIN_PROMISE_KEPT = 0.5
 def fit_with_effect(forward_model: ForwardModel, base: ModelFit, candidate: Candidate, robust_scale: float) -> ModelFit:
     """``base`` with the effect: strengths jointly with law and initial state; then its places or frequencies as well,
     if the information criterion asks for it. Else they are as guessed, and without a standard error. What ``base``
-    itself left at a guess stays there. If that falls short of the promise, the effect is begun at the candidate's
+    itself left at a guess stays there. If that falls short of the promise, the effect is started at the candidate's
     alternatives too, and the best goes on. Raises NonFiniteError."""
     if candidate.finite:
         return _from_finite_strengths(forward_model, base, candidate, robust_scale)

@@ -15,7 +15,7 @@ from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.config import RefineConfig
 
 NEGLIGIBLE_VARIANCE_RATIO = 0.25
-"""Variance over that of noise and discretization below which a difference of two fits tells nothing."""
+"""Variance over that of noise and discretization below which a difference of two fits is not significant."""
 
 
 def above_noise(fitted: ModelFit, noise: NoiseModel, config: RefineConfig) -> bool:

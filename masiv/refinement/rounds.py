@@ -49,7 +49,7 @@ class Failure:
 @dataclass(frozen=True)
 class Round:
     """One pass: what was tried on top of which model. trials: best first; accepted: one of them, or None.
-    indistinguishable_from: effects that may as well be there in place of the accepted one, as far as this motion tells.
+    indistinguishable_from: effects that explain this motion as well as the accepted one.
     """
 
     base: ModelFit

@@ -29,7 +29,7 @@ from masiv.workers import TaskError
 FALSE_MINIMUM_RATIO = 0.5
 """A model with one more effect that has less than this part of its base's cost may have got out of a false minimum."""
 MAX_PROMISE_ERROR = 1.5
-"""Factor by which a ranking, which is linear, may have judged an effect too small."""
+"""Factor by which a ranking, which is linear, may have underestimated an effect."""
 
 
 def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSettings) -> Round:
@@ -233,7 +233,7 @@ def _refit_from(
     shared = {p.name for p in fitted.parameters} & {p.name for p in best.parameters}
     values = {**fitted.values, **{n: best.values[n] for n in shared}}
     values = linear_strengths(forward_model, fitted.model, values, term.strengths, robust_scale)
-    # An effect that is not smooth is begun far from where it ends: four derivatives for two.
+    # An effect that is not smooth starts far from where it ends: four derivatives for two.
     budget = (4 if term.nonsmooth else 2) * (len(fitted.parameters) + 2)
     return gauss_newton_fit(
         forward_model, fitted.model, values, budget=budget, robust_scale=robust_scale,
@@ -263,9 +263,9 @@ def _restart_base(state: SearchState, best: ModelFit) -> ModelFit:
 
 def _judge(state: SearchState, trials: Sequence[Trial], settings: SearchSettings) -> list[Trial]:
     """``trials``, best first, with the objections to each."""
-    judged = [replace(t, objections=tuple(_objections(state, t.fitted, t, settings))) for t in trials]
-    more = {id(t): dominated_by(state, t, judged, settings) for t in judged if t.passes}
-    return [replace(t, objections=(*t.objections, *more.get(id(t), ()))) for t in judged]
+    with_objections = [replace(t, objections=tuple(_objections(state, t.fitted, t, settings))) for t in trials]
+    more = {id(t): dominated_by(state, t, with_objections, settings) for t in with_objections if t.passes}
+    return [replace(t, objections=(*t.objections, *more.get(id(t), ()))) for t in with_objections]
 
 
 def _objections(state: SearchState, fitted: ModelFit, trial: Trial, settings: SearchSettings) -> list[str]:
@@ -291,7 +291,7 @@ def dominated_by(state: SearchState, trial: Trial, trials: Sequence[Trial], sett
 
 
 def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Trial:
-    """``trial`` fitted to the end, its places free if that pays, and judged again."""
+    """``trial`` fitted to the end, its places free if that pays, and its objections again."""
     model, start = state.forward_model, trial.fitted
     final = gauss_newton_fit(
         model, start.model, start.values, budget=2 * len(start.parameters) + 6, robust_scale=state.robust_scale,

@@ -100,11 +100,11 @@ def _round(state: SearchState, base: ModelFit, settings: SearchSettings) -> Roun
     fits = map_tasks(settings.workers, model, _fit_in_addition, tasks)
     label = f"refine: fit effects in addition to {existing}"
     trials, failures = trials_of(label, base.model.family.kind, shortlist, fits, settings)
-    judged = [
+    with_objections = [
         replace(t, objections=tuple(objections_to_pair(model, state.fit, t.fitted, settings.config))) for t in trials
     ]
-    alike = confusable(ranking, judged, settings.config.confusable_correlation)
-    return Round(base, ranking, tuple(judged), None, alike, failures=tuple(failures))
+    alike = confusable(ranking, with_objections, settings.config.confusable_correlation)
+    return Round(base, ranking, tuple(with_objections), None, alike, failures=tuple(failures))
 
 
 def _fit_in_addition(

@@ -58,7 +58,7 @@ def _credible(passing: Sequence[Trial], noise: NoiseModel, config: RefineConfig)
 
 
 def _distinguished(best: ModelFit, trial: Trial, gain: float, noise: NoiseModel, config: RefineConfig) -> bool:
-    """Whether the data tells ``trial`` from the ``best`` fit: by Vuong's test, or, if it cannot be taken, by ``gain``,
+    """Whether the data distinguishes ``trial`` from the ``best`` fit: by Vuong's test, or without it by ``gain``,
     the fall of the information criterion from the simplest fit."""
     z = vuong_z(best, trial.fitted, noise)
     return z >= config.min_vuong_z if z is not None else gain <= -MIN_BIC_GAP

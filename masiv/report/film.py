@@ -32,7 +32,7 @@ def film(
 ) -> None:
     """Draw ``motion`` (T, Q, 3) [m] into ``out``/views/VIEW_FRAME.png and ``out``/video.mp4, the views side by side.
 
-    ``gaussians`` are those of frame 0, carried by the particles; the ground is drawn as a chequered plane.
+    ``gaussians`` are those of frame 0, moved by the particles; the ground is drawn as a chequered plane.
     """
     binding = Binding.at_rest(gaussians, motion[0])
     tile = float(np.ptp(motion[0], axis=0).max()) / 2
@@ -69,7 +69,7 @@ def balls(particles: np.ndarray, volume: float) -> Gaussians:
 
 
 def joined(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures beside each other, shorter ones filled up with white below: (H, W, 3) uint8."""
+    """Pictures side by side, shorter ones filled up with white below: (H, W, 3) uint8."""
     height = max(picture.shape[0] for picture in pictures)
     filled = [np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0)), constant_values=255) for p in pictures]
     return np.concatenate(filled, axis=1)

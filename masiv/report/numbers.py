@@ -39,7 +39,7 @@ def reconstruction_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussia
 
 
 def twin_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout: np.ndarray) -> dict[str, Any]:
-    """Pictures of the Gaussians carried by the twin's particles, over fitted and future frames, on every camera."""
+    """Pictures of the Gaussians moved by the twin's particles, over fitted and future frames, on every camera."""
     binding = Binding.at_rest(dynamic.at(0.0), rollout[0])
     views = list(range(len(scene.cameras)))
     return {
@@ -75,7 +75,7 @@ def run_numbers(
 
 
 def material_numbers(run: RunFolder) -> dict[str, Any]:
-    """What metrics.json says of the material, which is described beside the rest."""
+    """What metrics.json says of the material, which is described by another process."""
     material = read_material(run.path)
     return {} if material is None else {"material": {"summary": material["summary"]}}
 

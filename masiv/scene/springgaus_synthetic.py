@@ -106,7 +106,7 @@ def _camera(folder: Path, row: Mapping, where: str, names: list[str]) -> tuple[C
         raise InputError(str(error) if where in str(error) else f"{where}: {error}") from error
     mine = {frame: folder / name / file for frame, file in enumerate(names) if (folder / name / file).is_file()}
     if not mine:
-        raise InputError(f"{folder / name} has none of the pictures {names[0]} to {names[-1]} that {where} tells of")
+        raise InputError(f"{folder / name} has none of the pictures {names[0]} to {names[-1]} that {where} lists")
     width, height = common_size(list(mine.values()), f"camera {name} in {folder}")
     return Camera(name, width, height, np.array(intrinsics), world_to_camera), mine
 

@@ -107,7 +107,7 @@ def _effects(spec: SynthSpec, rest, volume: float) -> ActiveEffects:
 
 
 class Skin:
-    """Surface vertices (V, 3) [m] carried by particles (N, 3) [m], both at rest: each follows the affine map that fits
+    """Surface vertices (V, 3) [m] moved by particles (N, 3) [m], both at rest: each follows the affine map that fits
     best, in weighted least squares, how its nearest particles move."""
 
     def __init__(self, vertices: np.ndarray, particles: np.ndarray) -> None:

@@ -66,7 +66,7 @@ OFFSET_UNITS = {
     "tip_deflection": "m",
 }
 """How much later a body is let go than its markers show, how far from its rest it is held along two horizontal axes and
-the vertical one, and how far its tip is bent, see ``masiv.models.clamped_body``."""
+the vertical one, and how far its tip is deflected, see ``masiv.models.clamped_body``."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The twin as identify made it, kept beside the one to which refine added effects."""
+"""The twin as identify made it, kept in addition to the one to which refine added effects."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def material_section(page: Page, material: Mapping[str, Any]) -> None:
         "Grey: strains that this motion did not show, where the law is a guess. Dashed: the nearest classical law."
     )
     page.table(
-        ["classical law", "misfit [%]", "its best parameters"],
+        ["classical law", "residual [%]", "its best parameters"],
         [[m["kind"], _number(m["misfit_percent"]), _parameters(m["parameters"])] for m in material["families"]],
     )
     if material["sensitivities"]:
@@ -60,7 +60,7 @@ def material_section(page: Page, material: Mapping[str, Any]) -> None:
         )
         page.note(
             f"Against a fit's error of {material['error_mm']:.1f} mm. Excited: a tenth of that or more. Standard "
-            "errors hold the launch and the ground fixed; a dash: the motion does not tell it from another property."
+            "errors hold the initial state and the ground fixed; a dash: this motion does not determine it."
         )
 
 
