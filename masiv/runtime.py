@@ -38,12 +38,18 @@ def start(arch: str = "cpu") -> Any:
         # One of Taichi's own passes is half of a kernel's compilation, and LLVM does its work again; see ``adjoint``.
         ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, cfg_optimization=False)
     atexit.register(ti.reset)  # writes the kernel cache, which the next command starts from
-    running = ti.lang.impl.current_cfg().arch
+    running = _taichi_config().arch
     if arch != "cpu" and running != known[arch]:
         ti.reset()
         raise InputError(f"--arch {arch} is not available on this machine: use --arch cpu")
     _started = arch
     return ti
+
+
+def _taichi_config() -> Any:
+    from taichi.lang import impl
+
+    return impl.current_cfg()
 
 
 def adjoint(kernel: Any, *arguments: Any) -> None:
@@ -53,9 +59,7 @@ def adjoint(kernel: Any, *arguments: Any) -> None:
     in float32 (of v / (1 + c |v|) all of that by v). The switch is of the whole process: no other thread may compile a
     kernel at the same time.
     """
-    import taichi as ti
-
-    config = ti.lang.impl.current_cfg()
+    config = _taichi_config()
     config.cfg_optimization = True
     try:
         kernel.grad(*arguments)
@@ -70,9 +74,7 @@ def running_arch() -> str:
 
 def threads() -> int:
     """Threads of Taichi's kernels on a CPU."""
-    import taichi as ti
-
-    return ti.lang.impl.current_cfg().cpu_max_num_threads
+    return _taichi_config().cpu_max_num_threads
 
 
 @contextlib.contextmanager
