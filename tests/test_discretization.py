@@ -31,7 +31,7 @@ class Changing(ForwardModel):
         super().__init__([observation])
 
     def parameters(self, model):
-        raise NotImplementedError
+        raise AssertionError("not needed here")
 
     candidates = term = fields = parameters
 
