@@ -152,7 +152,7 @@ def balls(source: Path) -> dict:
         "gravity_each": [9.8 * (1 + trap.values[p.name]) for p in each.parameters],
         "information_gain_of_gravity_each": result.before.bic(trap.samples) - trap.bic(trap.samples),
         "trials": {
-            n: {"fit_mm": t.fitted.fit_mm, "held_out_mm": t.fitted.held_out_mm, "objections": t.reasons,
+            n: {"fit_mm": t.fitted.fit_mm, "held_out_mm": t.fitted.held_out_mm, "objections": list(t.objections),
                 "information_gain": result.before.bic(t.fitted.samples) - t.fitted.bic(t.fitted.samples)}
             for n, t in first.items()
         },
