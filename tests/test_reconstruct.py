@@ -15,7 +15,7 @@ from masiv.progress import silent
 from masiv.scene.scene import Frame, Scene
 from masiv.splat._reference import _render
 from masiv.splat.config import ReconstructConfig
-from masiv.splat.data_parallel import GradientWorker
+from masiv.splat.data_parallel import GradientWorker, Networks
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.losses import neighbour_pairs, ssim, strain
@@ -226,9 +226,9 @@ def test_what_the_second_process_cannot_draw_is_told_of(scene):
     pairs = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long)
     part = Part(((0, 0, np.zeros(3)),), 1, (0,), 1, None, scale_term=True)
     with GradientWorker() as worker:
-        worker.configure(objective, network, 4)
+        worker.configure(objective, Networks(network), 4)
         for _ in range(2):  # it goes on
-            worker.submit(gaussians, network, pairs, part)
+            worker.submit(gaussians, Networks(network), pairs, part, corrected=False)
             with pytest.raises(MasivError, match="not finite"):
                 worker.result()
         process = worker._process
