@@ -33,6 +33,7 @@ class Scene:
     ``load(view, frame)`` reads a picture and keeps those that were read last (``FrameCache``); ``frame(view, frame)``
     also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
     hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
+    time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
     """
 
     path: Path
@@ -50,6 +51,7 @@ class Scene:
     problems: tuple[str, ...] = ()
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
+    time_offsets: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.load, FrameCache):
