@@ -83,7 +83,9 @@ class BackgroundModel:
         empty = self.backgrounds[view]
         return self._log_odds(_with_light_of(image.astype(np.float32), empty), empty, self.noise.far, _CAST_SD)[1]
 
-    def _log_odds(self, picture: np.ndarray, empty: np.ndarray, covariance: np.ndarray, cast_sd: float) -> tuple[np.ndarray, np.ndarray]:
+    def _log_odds(
+        self, picture: np.ndarray, empty: np.ndarray, covariance: np.ndarray, cast_sd: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Log-odds (H, W) of the object before its prior, and the probability of shadow among background."""
         light = _log_student(picture - empty, covariance) + math.log(1 - _SHADOW_PRIOR)
         shade = empty * self.shadow_cast

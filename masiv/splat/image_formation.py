@@ -99,9 +99,9 @@ class Corrections:
     cameras: torch.Tensor
     exposures: torch.Tensor
 
-    def times(self, views: Sequence[int], frames: Sequence[int]) -> torch.Tensor:
-        """When images were taken, (K,) [s]: ``frames`` (K) of ``views`` (K)."""
-        return torch.tensor(frames) / self.formation.fps + self.cameras[list(views), 7]
+    def time_offsets(self, views: Sequence[int]) -> torch.Tensor:
+        """What the clocks of ``views`` (K) add to the times of their images, (K,) [s]."""
+        return self.cameras[list(views), 7]
 
     def positions(self, view: int, positions: torch.Tensor) -> torch.Tensor:
         """World points (N, 3) [m] -> points (N, 3) that the given camera projects as the corrected one does

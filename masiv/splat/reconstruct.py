@@ -78,7 +78,14 @@ class _Fit:
         self.half_extent = initial.half_extent
         hulls = tuple(HullLoss(hull) for hull in initial.hulls)
         self.objective = Objective(
-            config, initial.scale, initial.half_extent, scene.fps, scene.ground, hulls, self.images
+            config,
+            initial.scale,
+            initial.half_extent,
+            scene.fps,
+            scene.ground,
+            hulls,
+            self.images,
+            scene.view_time_offsets,
         )
         self.formation = self._image_formation(initial) if config.refine_calibration else None
         if state is not None and state["identity"] == self.identity:
