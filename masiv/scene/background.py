@@ -19,13 +19,13 @@ from scipy import ndimage
 
 from masiv.scene.markov import smooth_labels
 
-_BINS = 32
+_BINS = 64
 """Of the histogram of the object's colours, along each channel."""
 _DEGREES_OF_FREEDOM = 5.0
 """Of Student's t distribution of the noise: its tails allow for JPEG blocks, which are no Gaussian noise."""
 _SHADOW_PRIOR, _DEEPEST_SHADOW = 0.15, 0.7
 """Prior probability that the background is in shadow, and the largest share of light that a shadow takes."""
-_CAST_SD, _CAST_SD_NEAR = 2.0, 3.5
+_CAST_SD, _CAST_SD_NEAR = 2.0, 3.0
 """Standard deviation of the colour of a shadow about the scene's mean cast [grey levels], and near the object, which
 throws its own colour into its shadow. Measured on path-traced scenes: 2 and 3 grey levels."""
 _OUTLIER_SHARE = 0.3
@@ -83,7 +83,9 @@ class BackgroundModel:
         empty = self.backgrounds[view]
         return self._log_odds(_with_light_of(image.astype(np.float32), empty), empty, self.noise.far, _CAST_SD)[1]
 
-    def _log_odds(self, picture: np.ndarray, empty: np.ndarray, covariance: np.ndarray, cast_sd: float) -> tuple[np.ndarray, np.ndarray]:
+    def _log_odds(
+        self, picture: np.ndarray, empty: np.ndarray, covariance: np.ndarray, cast_sd: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Log-odds (H, W) of the object before its prior, and the probability of shadow among background."""
         light = _log_student(picture - empty, covariance) + math.log(1 - _SHADOW_PRIOR)
         shade = empty * self.shadow_cast
