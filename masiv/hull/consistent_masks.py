@@ -1,7 +1,8 @@
 """Masks of one frame that agree with each other: what several views say of a pixel counts.
 
 Masks that were estimated from colours have two defects that no view can see alone: a part of the object that looks like
-the background behind it is missing, and a shadow or a passer-by is included. The other views know the volume in question.
+the background behind it is missing, and a shadow or a passer-by is included. The other views know the volume in
+question.
 """
 
 from __future__ import annotations

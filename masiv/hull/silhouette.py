@@ -15,8 +15,8 @@ from masiv.scene.scene import Scene
 class Silhouette:
     """One view of one frame.
 
-    distance (H, W) float32 [pixels] to the mask's edge, negative on it. confidence (H, W) float32 in [0, 1] of the mask:
-    0 where object and background are equally probable. valid (H, W) bool.
+    distance (H, W) float32 [pixels] to the mask's edge, negative on it. confidence (H, W) float32 in [0, 1] of the
+    mask: 0 where object and background are equally probable. valid (H, W) bool.
     """
 
     view: int

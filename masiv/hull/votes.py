@@ -2,8 +2,8 @@
 
 In a visual hull (Laurentini 1994) each view has a veto, so one pixel that is missing from one mask removes all voxels
 behind it. Here a voxel that a single view denies is kept if other views need it: without it, pixels well inside of
-their masks would show no part of the hull. This is shape from inconsistent silhouettes (Landabaso, Pardàs & Casas 2008),
-decided voxel by voxel.
+their masks would show no part of the hull. This is shape from inconsistent silhouettes (Landabaso, Pardàs & Casas
+2008), decided voxel by voxel.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _NEEDED_BY = 2.0
 class Votes:
     """What each of V views says of N voxels.
 
-    denied (N, V) float32: confidence of a view that shows the voxel outside of its mask, else 0. cells (N, V): number of
-    the square of pixels that the voxel covers, -1 if the view does not show it. allowed (N,) bool: shown by enough views
-    and above the ground.
+    denied (N, V) float32: confidence of a view that shows the voxel outside of its mask, else 0. cells (N, V): number
+    of the square of pixels that the voxel covers, -1 if the view does not show it. allowed (N,) bool: shown by enough
+    views and above the ground.
     """
 
     denied: np.ndarray

@@ -45,7 +45,7 @@ def read_observation(path: str | Path) -> Scene | Tracks:
 
 
 def _with_consistent_masks(scene: Scene) -> Scene:
-    """Masks that are estimated from colours are made consistent over the views; those that are given are not touched."""
+    """Masks that are estimated from colours are made consistent over the views. Given ones are not changed."""
     return replace(scene, correct_masks=consistent_masks) if scene.masks_estimated else scene
 
 

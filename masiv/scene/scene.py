@@ -36,8 +36,9 @@ class Scene:
     also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
     mask_source: where masks come from, for messages. masks_estimated: from colours, none was given.
     correct_masks: makes the masks of the views of one frame agree, see ``masiv.hull.consistent_masks``; None for masks
-    that are given. hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
-    time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
+    that are given. hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences
+    for the user. time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps +
+    offset.
     """
 
     path: Path
