@@ -78,6 +78,11 @@ class Scene:
         """Indices of the cameras that are not held out."""
         return tuple(v for v in range(len(self.cameras)) if v not in self.hidden_views)
 
+    @property
+    def view_time_offsets(self) -> tuple[float, ...]:
+        """``time_offsets`` [s] of ``views``; empty if all clocks are exact."""
+        return tuple(self.time_offsets[view] for view in self.views) if any(self.time_offsets) else ()
+
     def frame(self, view: int, frame: int) -> Frame:
         """The picture of ``view`` at ``frame``; ``valid`` is False everywhere if there is none.
 
