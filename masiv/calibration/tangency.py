@@ -2,8 +2,9 @@
 
 A plane through the optical centres of two cameras that touches the object (at a frontier point) projects in both images
 to a line that is tangent to the silhouette. This holds exactly for every shape, without correspondences, and fails if a
-pose, a focal length, the time or a mask is wrong (Åström, Cipolla and Giblin 1999, doi:10.1023/A:1008168724024; Hernández,
-Schmitt and Cipolla 2007, doi:10.1109/TPAMI.2007.42). The convex hull of a silhouette has the same tangents.
+pose, a focal length, the time or a mask is wrong (Åström, Cipolla and Giblin, "Generalised epipolar constraints", IJCV
+33, 1999; Hernández, Schmitt and Cipolla, "Silhouette coherence for camera calibration under circular motion", PAMI 29,
+2007). The convex hull of a silhouette has the same outer tangents.
 """
 
 from __future__ import annotations

@@ -28,7 +28,10 @@ def conventions(scene: Scene) -> dict[str, Any]:
 
 
 def summarise(scene: Scene) -> dict[str, Any]:
-    """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem."""
+    """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem.
+
+    ``consistency_px`` of the cameras is not known here.
+    """
     problems = list(scene.problems)
     coverage = np.zeros((len(scene.views), scene.frame_count))
     seen = np.zeros(coverage.shape, bool)
@@ -60,6 +63,7 @@ def summarise(scene: Scene) -> dict[str, Any]:
                 "principal_point_px": [float(camera.intrinsics[0, 2]), float(camera.intrinsics[1, 2])],
                 "position_m": camera.centre.tolist(),
                 "frames": pictures.get(view, 0),
+                "consistency_px": None,
             }
             for view, camera in enumerate(scene.cameras)
         ],
@@ -92,6 +96,15 @@ def as_text(summary: dict[str, Any]) -> str:
         + ("" if camera["frames"] == summary["frames"] else f"  {camera['frames']} of {summary['frames']} frames")
         for index, camera in enumerate(summary["cameras"])
     ]
+    lines += _agreement(summary["cameras"])
     lines += ["problems " + ("none" if not summary["problems"] else "")]
     lines += [f"  - {problem}" for problem in summary["problems"]]
     return "\n".join([*lines, f"picture  {summary['picture']}"])
+
+
+def _agreement(cameras: list[dict[str, Any]]) -> list[str]:
+    """One line: the error of each camera's silhouettes against those of the others."""
+    known = [
+        f"{index}: {c['consistency_px']:.2f}" for index, c in enumerate(cameras) if c["consistency_px"] is not None
+    ]
+    return [f"agreement of the silhouettes with those of the other cameras [px]  {', '.join(known)}"] if known else []
