@@ -14,8 +14,8 @@ from masiv.calibration.tangency import Outline, outline, tangency_errors
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 
-MAX_RATIO = {3: 12.0, 4: 6.0, 5: 4.5}
-MAX_RATIO_OF_MORE = 4.0
+MAX_RATIO = {3: 15.0, 4: 6.5, 5: 5.0}
+MAX_RATIO_OF_MORE = 4.5
 """A camera stands out if its error is more than this times the error among the others, by the number of cameras.
 
 99 % quantiles of the largest ratio over the cameras of rings with the same random errors on each camera, which

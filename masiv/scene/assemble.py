@@ -42,7 +42,9 @@ def assemble(
     problems: Iterable[str] = (),
 ) -> Scene:
     """The scene. Raises InputError for a frame or camera without a picture and for a scene.yaml that does not fit."""
-    cameras = pictures.cameras
+    shutters = declaration.shutters(pictures.cameras, fps)
+    cameras = tuple(replace(c, shutter=s) for c, s in zip(pictures.cameras, shutters, strict=True))
+    pictures = replace(pictures, cameras=cameras)
     if declaration.fit_frames is not None and declaration.fit_frames > frame_count:
         raise InputError(f"scene.yaml: fit_frames is {declaration.fit_frames}, the scene has {frame_count} frames")
     gaps = _gaps(folder, pictures, frame_count)

@@ -24,6 +24,18 @@ def conventions(scene: Scene) -> dict[str, Any]:
         "ground": ground,
         "density_kg_m3": float(scene.density),
         "mask_source": scene.mask_source,
+        **_shutters(scene),
+    }
+
+
+def _shutters(scene: Scene) -> dict[str, Any]:
+    """Exposure and readout times of the cameras [s], if there is one that is not zero."""
+    shutters = [camera.shutter for camera in scene.cameras]
+    if all(shutter.is_instant for shutter in shutters):
+        return {}
+    return {
+        "exposure_time_s": [shutter.exposure_time for shutter in shutters],
+        "readout_time_s": [shutter.readout_time for shutter in shutters],
     }
 
 
@@ -90,6 +102,9 @@ def as_text(summary: dict[str, Any]) -> str:
         f"({coverage['min']:.1%} to {coverage['max']:.1%})",
         f"cameras  {summary['views']}",
     ]
+    for key, name in (("exposure_time_s", "exposure"), ("readout_time_s", "readout ")):
+        if key in summary:
+            lines.append(f"{name} " + ", ".join(f"{1e3 * time:.3g}" for time in summary[key]) + " ms")
     lines += [
         f"  {index:2d} {camera['name']:10s} {camera['width_px']}×{camera['height_px']}"
         f"  focal {camera['focal_px'][0]:.1f} px  at {numbers(camera['position_m'])} m"

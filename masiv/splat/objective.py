@@ -11,6 +11,7 @@ import torch
 from masiv.scene.scene import Ground
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
+from masiv.splat.exposure import expose, velocities
 from masiv.splat.hull_loss import HullLoss
 from masiv.splat.losses import Pairs, ssim, strain
 from masiv.splat.observed_image import ObservedImage
@@ -124,8 +125,14 @@ class Objective:
             k, observed = frames.index(frame), self.images[frame][index]
             background = torch.tensor(drawn_background, dtype=torch.float32)
             scales = (gaussians["log_scales"] + log_changes[k]).exp()
-            drawn = render(observed.camera, means + displacements[k], scales, opacities, colours, background)
-            loss = loss + self._image_loss(drawn.rgb, drawn.alpha, observed, background) / part.image_count
+            shown = observed.camera, means + displacements[k]
+            if observed.camera.shutter.is_instant:
+                drawn = render(*shown, scales, opacities, colours, background)
+                rgb, alpha = drawn.rgb, drawn.alpha
+            else:
+                velocity = velocities(network, means.detach(), frame / self.fps, observed.camera)
+                rgb, alpha = expose(*shown, velocity, scales, opacities, colours, background)
+            loss = loss + self._image_loss(rgb, alpha, observed, background) / part.image_count
         return loss
 
     def _regularization(

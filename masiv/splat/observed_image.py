@@ -94,4 +94,10 @@ def _reduced_camera(camera: Camera, factor: int) -> Camera:
     """The camera of an image averaged over factor x factor blocks. All of K scales, since pixel centres are at +0.5."""
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2] /= factor
-    return replace(camera, width=camera.width // factor, height=camera.height // factor, intrinsics=intrinsics)
+    return replace(
+        camera,
+        width=camera.width // factor,
+        height=camera.height // factor,
+        intrinsics=intrinsics,
+        shutter=camera.shutter.reduced(factor),
+    )

@@ -68,6 +68,8 @@ class _Fit:
         self.identity = repr(
             (config.model_dump(exclude={"processes"}), seed, str(scene.path), scene.frame_count, scene.views)
         )
+        shutters = [scene.cameras[view].shutter for view in scene.views]
+        self.identity += "" if all(s.is_instant for s in shutters) else repr(shutters)
         progress("reconstruct", 0, config.iterations, "carving hulls")
         initial = initial_gaussians(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
         self.half_extent = initial.half_extent
