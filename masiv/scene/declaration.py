@@ -33,9 +33,9 @@ class SceneDeclaration(BaseModel):
 
     fps: frames per second. up_axis: x, y, z, with a minus sign, or three numbers. gravity: three numbers [m/s²], or one
     magnitude along −up. ground: `none` or {normal, height}. density [kg/m³]. crop_box: two opposite corners [m, world];
-    masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given. exposure_time [s] of a row.
-    readout_time [s]: of a rolling shutter, from the top row to the last one; negative if the last row is read first. Both
-    are one number, or a mapping from names of cameras; those that are not in it have 0.
+    masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given. exposure_time [s]: of a
+    row. readout_time [s]: of a rolling shutter, from the top row to the last one; negative if the last row is read
+    first. Both are one number, or a mapping from names of cameras; those that are not in it have 0.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import torch
 
-Rows = TypeVar("Rows", np.ndarray, torch.Tensor)
+if TYPE_CHECKING:
+    import torch
+
+Rows = TypeVar("Rows", np.ndarray, "torch.Tensor")
 
 
 @dataclass(frozen=True)
@@ -16,8 +18,8 @@ class Shutter:
     """Row by row exposure. The time of a frame is the middle of the exposure of the middle row.
 
     exposure_time [s] of each row. readout_time [s]: from the first (top) row to the last one; negative if the last row
-    is read first. first_row, last_row [pixels]: y of the centres of the sensor's first and last row in this image, which
-    can be a crop of the whole picture.
+    is read first. first_row, last_row [pixels]: y of the centres of the sensor's first and last row in this image,
+    which can be a crop of the whole picture.
     """
 
     exposure_time: float = 0.0
@@ -36,7 +38,7 @@ class Shutter:
         return self.exposure_time == 0 and self.readout_time == 0
 
     def row_times(self, rows: Rows) -> Rows:
-        """Middle of the exposure [s], relative to the frame's time, at y = ``rows`` [pixels]; outside as at the edge."""
+        """Middle of the exposure [s] after the frame's time, at y = ``rows`` [pixels]; outside as at the edge."""
         fraction = (rows - self.first_row) / (self.last_row - self.first_row)
         return self.readout_time * (fraction.clip(0.0, 1.0) - 0.5)
 

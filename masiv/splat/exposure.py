@@ -10,8 +10,10 @@ from masiv.scene.camera import Camera
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.rasteriser import render
 
-SAMPLE_STEP = 2.0  # pixels
-"""Motion between two samples of an exposure, at most, unless ``MAX_SAMPLES`` is reached."""
+SAMPLE_STEP = 1.0  # pixels
+"""Motion between two samples of an exposure, at most, unless ``MAX_SAMPLES`` is reached. Of the error of an image
+without blur, 4 % are left with steps of 1 pixel, 27 % with 2 (Gaussians of 0.6 pixels with random colours, motion of 4
+pixels, against 128 samples)."""
 MAX_SAMPLES = 8
 """Renders of one image, at most: the time of a step grows with them."""
 
@@ -40,8 +42,8 @@ def expose(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """rgb (H, W, 3) and alpha (H, W) of Gaussians that are at ``means`` (N, 3) [m] at the frame's time.
 
-    The mean of renders that are spread over the exposure time. In each of them a Gaussian is where it is when its row is
-    read, x + v (t_row + t_sample): ``velocity`` (N, 3) [m/s] is taken as constant over the exposure of one image.
+    The mean of renders that are spread over the exposure time. In each of them a Gaussian is where it is when its row
+    is read, x + v (t_row + t_sample): ``velocity`` (N, 3) [m/s] is taken as constant over the exposure of one image.
     """
     count = sample_count(camera, means, velocity)
     drawn = []
