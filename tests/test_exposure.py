@@ -7,10 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from ring_scene import pixel_rays, ring, spheres_scene
 from textured_ball import FPS, SIDE, ball, camera_at
 
+from masiv.continuum.losses import load_views, outside_of_mask
 from masiv.errors import InputError
+from masiv.hull.carve import visual_hull
+from masiv.hull.rolling_shutter import with_velocities
 from masiv.scene.declaration import SceneDeclaration
+from masiv.scene.frame_cache import Frame
 from masiv.scene.shutter import Shutter
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
@@ -219,3 +224,47 @@ def test_declared_for_all_cameras_or_by_name():
         SceneDeclaration(exposure_time={"top": 0.01}).shutters(cameras, 24)
     with pytest.raises(InputError, match="exposure_time is 10 s, a frame has 0"):
         SceneDeclaration(exposure_time=10.0).shutters(cameras, 24)
+
+
+def falling_sphere(readout_time):
+    """A sphere that crosses 40 of 160 rows between two frames; every row shows it when it is read."""
+    cameras = ring(6, size=160, focal=250.0)
+    velocity, start = np.array([1.5, -6.0, 0.0]), np.array([-0.1, 0.9, 0.0])
+    shutters = [Shutter.of_image(0.0, readout_time * sign, 160) for sign in (1, 1, 1, -1, -1, 0)]
+    cameras = tuple(dataclasses.replace(c, shutter=s) for c, s in zip(cameras, shutters, strict=True))
+
+    def load(view, frame):
+        camera, rays = cameras[view], pixel_rays(cameras[view])
+        times = frame / 24 + camera.shutter.row_times(np.arange(160) + 0.5)
+        offset = start + times[:, None] * velocity - camera.centre
+        along = (rays * offset[:, None]).sum(-1)
+        mask = (offset**2).sum(-1)[:, None] - along**2 < 0.2**2
+        return Frame(np.zeros((160, 160, 3), np.uint8), mask.astype(np.float32), np.ones((160, 160), bool))
+
+    scene = dataclasses.replace(spheres_scene(lambda _: [], cameras=cameras, frame_count=3), load=load, ground=None)
+    return scene, start + velocity / 24 * np.arange(3)[:, None], velocity
+
+
+def test_a_hull_is_that_of_the_frames_time():
+    """The volume and the place of a sphere whose silhouettes are sheared and shifted, up or down."""
+    plain, centres, velocity = falling_sphere(0.0)
+    assert with_velocities(plain) is plain
+    scene, *_ = falling_sphere(0.02)
+    known = with_velocities(scene)
+    assert known.velocities is not None
+    np.testing.assert_allclose(known.velocities, np.tile(velocity, (3, 1)), atol=0.1 * np.linalg.norm(velocity))
+    exact = visual_hull(plain, 0, resolution=32).volume
+    right, wrong = (visual_hull(s, 0, resolution=32) for s in (known, scene))
+    assert right.volume == pytest.approx(exact, rel=0.04)
+    assert wrong.volume < 0.85 * exact
+    assert np.linalg.norm(right.points.mean(axis=0) - centres[0]) < 0.005
+
+
+def test_points_of_the_object_are_not_outside_of_its_sheared_masks():
+    """The silhouette term of the trajectory."""
+    scene, centres, velocity = falling_sphere(0.02)
+    points = torch.tensor(centres[0] + 0.196 * UNIT, dtype=torch.float32)
+    known = dataclasses.replace(scene, velocities=np.tile(velocity, (3, 1)))
+    for right, wrong in zip(load_views(known)[0][:5], load_views(scene)[0][:5], strict=True):
+        assert outside_of_mask(points, right).max() < 0.003
+        assert outside_of_mask(points, wrong).max() > 0.01

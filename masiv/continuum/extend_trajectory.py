@@ -15,6 +15,7 @@ from masiv.continuum.finetune import KnownMotion, fine_tune
 from masiv.continuum.trajectory import Trajectory, positions_at
 from masiv.errors import InputError, MasivError
 from masiv.hull.carve import visual_hull
+from masiv.hull.rolling_shutter import with_velocities
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
@@ -48,6 +49,7 @@ def extend_trajectory(
             f"{scene.path} has {scene.frame_count} frames, the extended motion {motion.frame_count} and the trajectory "
             f"{known}: give the scene and the motion of the same frames, more than the trajectory has"
         )
+    scene = with_velocities(scene, dynamic.base_positions(scene.times))
     start = FilledVolume(trajectory.positions[0].astype(np.float64), trajectory.spacing, trajectory.volume)
     hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
     volumes = []

@@ -21,6 +21,7 @@ from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
 from masiv.files import write_npz
 from masiv.hull.carve import visual_hull
+from masiv.hull.rolling_shutter import with_velocities
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
@@ -93,6 +94,7 @@ def estimate_trajectory(
     Held-out views are not used. Raises MasivError if a frame has no volume to fill or the motion becomes non-finite.
     """
     checkpoint = checkpoint or Checkpoint(None)
+    scene = with_velocities(scene, dynamic.base_positions(scene.times))
     start = fill_first_frame(scene, dynamic, config)
     hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
     volumes = []

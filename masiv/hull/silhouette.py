@@ -13,12 +13,27 @@ from masiv.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Silhouette:
-    """One view of one frame: distance (H, W) float32 [pixels] to the mask's edge, negative on it; valid (H, W) bool."""
+    """One view of one frame.
+
+    distance (H, W) float32 [pixels] to the mask's edge, negative on it; valid (H, W) bool. velocity (3,) [m/s] of the
+    object if it is known and the camera has a rolling shutter.
+    """
 
     view: int
     camera: Camera
     distance: np.ndarray
     valid: np.ndarray
+    velocity: np.ndarray | None = None
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As ``Camera.project``, of points that are at ``points`` at the frame's time and move with ``velocity``."""
+        pixels, depth = self.camera.project(points)
+        if self.velocity is not None:
+            # The row depends on the time and the time on the row: a fixed-point iteration.
+            for _ in range(2):
+                read = self.camera.shutter.row_times(pixels[:, 1])
+                pixels, depth = self.camera.project(points + read[:, None] * self.velocity)
+        return pixels, depth
 
     def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Signed distances of world points (N, 3) [m] to this silhouette, (N,) [m], measured at each point's depth.
@@ -26,7 +41,7 @@ class Silhouette:
         Negative on the object, 0 for a point that is not visible. Also returns ``inside_image`` (N,) bool and
         ``visible`` (N,) bool: inside the image and not behind an occluder.
         """
-        pixels, depth = self.camera.project(points)
+        pixels, depth = self.project(points)
         height, width = self.distance.shape
         in_front = depth > 1e-6
         pixels = np.where(in_front[:, None], pixels, -1.0)
@@ -41,8 +56,15 @@ class Silhouette:
 
 def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
     """The silhouettes of ``frame`` in every view that is not held out."""
-    pictures = ((view, scene.frame(view, frame)) for view in scene.views)
-    return tuple(Silhouette(view, scene.cameras[view], signed_distance(p.mask), p.valid) for view, p in pictures)
+    pictures = ((view, scene.cameras[view], scene.frame(view, frame)) for view in scene.views)
+    return tuple(
+        Silhouette(view, camera, signed_distance(p.mask), p.valid, _velocity(scene, camera, frame))
+        for view, camera, p in pictures
+    )
+
+
+def _velocity(scene: Scene, camera: Camera, frame: int) -> np.ndarray | None:
+    return None if scene.velocities is None or camera.shutter.readout_time == 0 else scene.velocities[frame]
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:

@@ -33,6 +33,8 @@ class Scene:
     ``load(view, frame)`` reads a picture and keeps those that were read last (``FrameCache``); ``frame(view, frame)``
     also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
     hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
+    velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for silhouettes of
+    cameras with a rolling shutter.
     """
 
     path: Path
@@ -50,6 +52,7 @@ class Scene:
     problems: tuple[str, ...] = ()
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
+    velocities: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.load, FrameCache):

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.hull.carve import visual_hull
+from masiv.hull.rolling_shutter import with_velocities
 from masiv.hull.shadow_volume import remove_shadow_volume
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
@@ -97,6 +98,7 @@ class _ExtensionFit:
         self.images = dict(zip(new, observed_images(scene, config, new), strict=True))
         progress("extend frames", 0, self.iterations, "carving hulls")
         frames = range(self.known - 1, self.count)
+        scene = with_velocities(scene)
         first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
         hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from masiv.errors import MasivError
 from masiv.hull.carve import VisualHull, visual_hull
+from masiv.hull.rolling_shutter import with_velocities
 from masiv.hull.shadow_volume import remove_shadow_volume
 from masiv.scene.scene import Scene
 
@@ -34,6 +35,7 @@ def initial_gaussians(scene: Scene, count: int, resolution: int, rng: np.random.
 
     Raises MasivError if a hull is empty or the first one is a single voxel.
     """
+    scene = with_velocities(scene)
     hull = visual_hull(scene, 0, resolution=resolution)
     later = (visual_hull(scene, frame, resolution=resolution) for frame in range(1, scene.frame_count))
     hulls = (hull, *(remove_shadow_volume(scene, frame, h, hull.volume) for frame, h in enumerate(later, start=1)))
