@@ -21,7 +21,7 @@ _LARGEST_SIDE = 256
 class View:
     """One mask as tensors: signed distance (H, W) [pixels] to its edge, pose (3, 4) [m] and pinhole (3, 3) [pixels].
 
-    velocity (3,) [m/s] of the object, if the camera has a rolling ``shutter``.
+    velocity (3,) [m/s] of the object, if rows show other times than the frame's: ``shutter``, time_offset [s].
     """
 
     distance: torch.Tensor
@@ -29,6 +29,7 @@ class View:
     pinhole: torch.Tensor
     shutter: Shutter = INSTANT
     velocity: torch.Tensor | None = None
+    time_offset: float = 0.0
 
 
 def load_views(scene: Scene) -> list[list[View]]:
@@ -50,7 +51,8 @@ def _view(silhouette) -> View:
     pose = torch.as_tensor(silhouette.camera.world_to_camera[:3], dtype=torch.float32)
     velocity = None if silhouette.velocity is None else torch.as_tensor(silhouette.velocity, dtype=torch.float32)
     shutter = silhouette.camera.shutter.reduced(height / distance.shape[0])
-    return View(torch.as_tensor(distance), pose, torch.as_tensor(pinhole, dtype=torch.float32), shutter, velocity)
+    pinhole = torch.as_tensor(pinhole, dtype=torch.float32)
+    return View(torch.as_tensor(distance), pose, pinhole, shutter, velocity, silhouette.time_offset)
 
 
 def outside_of_mask(positions: torch.Tensor, view: View) -> torch.Tensor:
@@ -58,7 +60,7 @@ def outside_of_mask(positions: torch.Tensor, view: View) -> torch.Tensor:
     in_camera, depth, pixels = _project(positions, view)
     if view.velocity is not None:
         for _ in range(2):
-            read = view.shutter.row_times(pixels.detach()[:, 1])
+            read = view.time_offset + view.shutter.row_times(pixels.detach()[:, 1])
             in_camera, depth, pixels = _project(positions + read[:, None] * view.velocity, view)
     size = pixels.new_tensor([view.distance.shape[1], view.distance.shape[0]])
     grid = 2 * pixels / size - 1

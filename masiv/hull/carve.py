@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from masiv.errors import MasivError
 from masiv.hull.silhouette import Silhouette, silhouettes
+from masiv.hull.votes import consensus, vote
 from masiv.scene.scene import Ground, Scene
 
 _COARSE = 24
@@ -51,29 +52,21 @@ def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull
     spacing = float((upper - lower).max()) / resolution
     counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
     grid = _cell_centres(lower, spacing, counts)
-    occupied = occupancy(views, grid, 0.25 * spacing, scene.ground).reshape(counts)
+    occupied = occupancy(views, grid, 0.25 * spacing, spacing, scene.ground).reshape(counts)
     if not occupied.any():
         raise MasivError(_no_volume(views, occupied_views, scene, frame))
     return VisualHull(grid[occupied.ravel()], spacing, surface_of(occupied)[occupied])
 
 
 def occupancy(
-    views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float, ground: Ground | None = None
+    views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float, spacing: float, ground: Ground | None = None
 ) -> np.ndarray:
-    """Which world points (N, 3) [m] are within ``tolerance`` [m] of every silhouette and above the ground, (N,) bool.
+    """Which voxels with centres ``points`` (N, 3) [m] and side ``spacing`` [m] belong to the hull, (N,) bool.
 
-    A point must be inside the image of at least two views and of half of them.
+    A voxel is above the ground, inside the image of at least two views and of half of them, and at most ``tolerance``
+    [m] outside of every mask, except where the views outvote one of them: see ``masiv.hull.votes``.
     """
-    kept = np.ones(len(points), bool)
-    if ground is not None:
-        kept &= points @ ground.normal >= ground.height - 0.5 * tolerance
-    shown = np.zeros(len(points), np.int32)
-    for view in views:
-        alive = np.flatnonzero(kept)
-        distance, inside_image, _ = view.distances(points[alive])
-        shown[alive] += inside_image
-        kept[alive] = distance <= tolerance
-    return kept & (shown >= max(2, len(views) // 2))
+    return consensus(views, vote(views, points, tolerance, ground, spacing), points, spacing)
 
 
 def surface_of(occupied: np.ndarray) -> np.ndarray:
@@ -91,7 +84,7 @@ def _object_box(views, seen, ground, frame: int, scene: Scene) -> tuple[np.ndarr
         counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
         grid = _cell_centres(lower, spacing, counts)
         # Half of a cell's diagonal: no cell that contains a part of the object is removed.
-        kept = grid[occupancy(views, grid, 0.87 * spacing, ground)]
+        kept = grid[occupancy(views, grid, 0.87 * spacing, spacing, ground)]
         if len(kept) == 0:
             raise MasivError(_no_volume(views, seen, scene, frame))
         lower, upper = (
@@ -135,7 +128,9 @@ def _no_volume(views, seen: list[Silhouette], scene: Scene, frame: int) -> str:
     spacing = 2 * radius / _COARSE
     grid = _cell_centres(centre - radius, spacing, np.full(3, _COARSE))
     left = {
-        view.view: int(occupancy(tuple(v for v in views if v is not view), grid, 0.5 * spacing, scene.ground).sum())
+        view.view: int(
+            occupancy(tuple(v for v in views if v is not view), grid, 0.5 * spacing, spacing, scene.ground).sum()
+        )
         for view in views
     }
     worst = max(left, key=lambda view: left[view])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,15 +15,18 @@ from masiv.scene.scene import Scene
 class Silhouette:
     """One view of one frame.
 
-    distance (H, W) float32 [pixels] to the mask's edge, negative on it; valid (H, W) bool. velocity (3,) [m/s] of the
-    object if it is known and the camera has a rolling shutter.
+    distance (H, W) float32 [pixels] to the mask's edge, negative on it. confidence (H, W) float32 in [0, 1] of the
+    mask: 0 where object and background are equally probable. valid (H, W) bool. velocity (3,) [m/s] of the object if it
+    is known and pixels show other times than the frame's: by a rolling shutter, or a clock with a time_offset [s].
     """
 
     view: int
     camera: Camera
     distance: np.ndarray
+    confidence: np.ndarray
     valid: np.ndarray
     velocity: np.ndarray | None = None
+    time_offset: float = 0.0
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As ``Camera.project``, of points that are at ``points`` at the frame's time and move with ``velocity``."""
@@ -31,7 +34,7 @@ class Silhouette:
         if self.velocity is not None:
             # The row depends on the time and the time on the row: a fixed-point iteration.
             for _ in range(2):
-                read = self.camera.shutter.row_times(pixels[:, 1])
+                read = self.time_offset + self.camera.shutter.row_times(pixels[:, 1])
                 pixels, depth = self.camera.project(points + read[:, None] * self.velocity)
         return pixels, depth
 
@@ -57,14 +60,24 @@ class Silhouette:
 def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
     """The silhouettes of ``frame`` in every view that is not held out."""
     pictures = ((view, scene.cameras[view], scene.frame(view, frame)) for view in scene.views)
+    found = (silhouette(view, camera, p.mask, p.valid) for view, camera, p in pictures)
+    if scene.velocities is None:
+        return tuple(found)
+    velocity = scene.velocities[frame]
     return tuple(
-        Silhouette(view, camera, signed_distance(p.mask), p.valid, _velocity(scene, camera, frame))
-        for view, camera, p in pictures
+        replace(s, velocity=velocity, time_offset=scene.time_offset(s.view)) if scene.shows_other_times(s.view) else s
+        for s in found
     )
 
 
-def _velocity(scene: Scene, camera: Camera, frame: int) -> np.ndarray | None:
-    return None if scene.velocities is None or camera.shutter.readout_time == 0 else scene.velocities[frame]
+def silhouette(view: int, camera: Camera, mask: np.ndarray, valid: np.ndarray) -> Silhouette:
+    """The silhouette of ``mask`` (H, W) in [0, 1].
+
+    A pixel at the outline shows both object and background. Its mask is near one half, but the outline is certain if it
+    is next to pixels that are.
+    """
+    confidence = cv2.dilate(np.abs(2 * mask - 1).astype(np.float32), np.ones((3, 3), np.uint8))
+    return Silhouette(view, camera, signed_distance(mask), confidence, valid)
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:

@@ -34,7 +34,8 @@ class Scene:
     also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
     hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
     velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for silhouettes of
-    cameras with a rolling shutter.
+    views that show other times than the frame's.
+    time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
     """
 
     path: Path
@@ -53,6 +54,7 @@ class Scene:
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
     velocities: np.ndarray | None = None
+    time_offsets: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.load, FrameCache):
@@ -67,6 +69,14 @@ class Scene:
     def views(self) -> tuple[int, ...]:
         """Indices of the cameras that are not held out."""
         return tuple(v for v in range(len(self.cameras)) if v not in self.hidden_views)
+
+    def time_offset(self, view: int) -> float:
+        """Of the clock of ``view`` [s]."""
+        return self.time_offsets[view] if self.time_offsets else 0.0
+
+    def shows_other_times(self, view: int) -> bool:
+        """Whether pixels of ``view`` show other times than that of their frame: rolling shutter, clock."""
+        return self.cameras[view].shutter.readout_time != 0 or self.time_offset(view) != 0
 
     def frame(self, view: int, frame: int) -> Frame:
         """The picture of ``view`` at ``frame``; ``valid`` is False everywhere if there is none.

@@ -8,16 +8,21 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from masiv.scene.calibration import Calibration
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
 class DynamicGaussians:
-    """canonical: the Gaussians at frame 0; deformation: their displacement and change of size at a time."""
+    """canonical: the Gaussians at frame 0; deformation: their displacement and change of size at a time.
+
+    calibration: the cameras as they were refined with them; None if they were kept as given.
+    """
 
     canonical: Gaussians
     deformation: DeformationNetwork
+    calibration: Calibration | None = None
 
     def at(self, time: float) -> Gaussians:
         """The Gaussians at ``time`` [s], 0 at the first frame; without gradients."""
@@ -34,14 +39,18 @@ class DynamicGaussians:
         return (self.canonical.means.mean(dim=0) + moved).double().numpy()
 
     def save(self, folder: Path) -> None:
-        """Write gaussians.ply and deformation.safetensors into ``folder``."""
+        """Write gaussians.ply, deformation.safetensors and, if cameras were refined, calibration.json to ``folder``."""
         self.canonical.save_ply(Path(folder) / "gaussians.ply")
         self.deformation.save(Path(folder) / "deformation.safetensors")
+        if self.calibration is not None:
+            self.calibration.save(folder)
 
     @classmethod
     def load(cls, folder: Path) -> DynamicGaussians:
         """Read what ``save`` wrote. Raises InputError if a file is missing or broken."""
         folder = Path(folder)
         return cls(
-            Gaussians.load_ply(folder / "gaussians.ply"), DeformationNetwork.load(folder / "deformation.safetensors")
+            Gaussians.load_ply(folder / "gaussians.ply"),
+            DeformationNetwork.load(folder / "deformation.safetensors"),
+            Calibration.load(folder),
         )

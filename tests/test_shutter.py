@@ -13,17 +13,17 @@ from textured_ball import FPS, SIDE, ball, camera_at
 from masiv.continuum.losses import load_views, outside_of_mask
 from masiv.errors import InputError
 from masiv.hull.carve import visual_hull
-from masiv.hull.rolling_shutter import with_velocities
+from masiv.hull.velocity import with_velocities
 from masiv.scene.declaration import SceneDeclaration
 from masiv.scene.frame_cache import Frame
 from masiv.scene.shutter import Shutter
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
-from masiv.splat.exposure import MAX_SAMPLES, SAMPLE_STEP, at_row, expose, sample_count, velocities
 from masiv.splat.losses import neighbour_pairs
 from masiv.splat.objective import Objective, Part
 from masiv.splat.observed_image import ObservedImage
 from masiv.splat.rasteriser import render
+from masiv.splat.shutter import MAX_SAMPLES, SAMPLE_STEP, at_row, expose, sample_count, velocities
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -196,7 +196,7 @@ def test_the_loss_of_reconstruct_is_least_with_the_right_shutter():
         rgb, alpha = filmed(camera(BOTH), lambda time, f=frame: POINTS + VELOCITY * (time + f / FPS), 8)
         part = Part(((frame, 0, np.full(3, 0.4)),), 1, (), 1, None, scale_term=False)
         for name, shutter in shutters.items():
-            observed = ObservedImage(camera(shutter), rgb.float(), alpha.float(), torch.ones(SIDE, SIDE))
+            observed = ObservedImage(0, camera(shutter), rgb.float(), alpha.float(), torch.ones(SIDE, SIDE))
             objective = Objective(ReconstructConfig(), 0.016, 0.25, FPS, None, {}, {frame: [observed]})
             losses[name] = float(objective.part(gaussians, network, pairs, part).detach())
         assert min(losses, key=lambda name: losses[name]) == "right", (frame, losses)
@@ -268,3 +268,21 @@ def test_points_of_the_object_are_not_outside_of_its_sheared_masks():
     for right, wrong in zip(load_views(known)[0][:5], load_views(scene)[0][:5], strict=True):
         assert outside_of_mask(points, right).max() < 0.003
         assert outside_of_mask(points, wrong).max() > 0.01
+
+
+def test_a_hull_takes_each_clock_into_account():
+    """Views 1 and 4 are a quarter of a frame late and early."""
+    offsets = (0.0, 0.25 / 24, 0.0, 0.0, -0.25 / 24, 0.0)
+    plain, centres, velocity = falling_sphere(0.0)
+    cameras = plain.cameras
+
+    def load(view, frame):
+        offset = centres[frame] + offsets[view] * velocity - cameras[view].centre
+        mask = offset @ offset - (pixel_rays(cameras[view]) @ offset) ** 2 < 0.2**2
+        return Frame(np.zeros((160, 160, 3), np.uint8), mask.astype(np.float32), np.ones((160, 160), bool))
+
+    late = dataclasses.replace(plain, load=load)
+    known = with_velocities(dataclasses.replace(late, time_offsets=offsets), centres)
+    exact = visual_hull(plain, 1, resolution=32).volume
+    assert visual_hull(known, 1, resolution=32).volume == pytest.approx(exact, rel=0.03)
+    assert visual_hull(late, 1, resolution=32).volume < 0.85 * exact

@@ -1,4 +1,4 @@
-"""The mean velocity of the object, for silhouettes of cameras with a rolling shutter."""
+"""The mean velocity of the object, for silhouettes that show other times than the frame's: rolling shutter, clock."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ _RESOLUTION = 24
 def with_velocities(scene: Scene, positions: np.ndarray | None = None) -> Scene:
     """``scene`` with the mean velocity of the object at each frame, if a camera needs it.
 
-    positions (T, 3) [m]: of the object's centre at the T frames; None: centroids of hulls that neglect the shutter.
+    positions (T, 3) [m]: of the object's centre at the T frames; None: centroids of hulls that take all pixels at the
+    frame's time.
     The velocity at a frame is the central difference. Raises MasivError if a hull is empty.
     """
-    if all(scene.cameras[view].shutter.readout_time == 0 for view in scene.views):
+    if not any(scene.shows_other_times(view) for view in scene.views):
         return scene
     if positions is None:
         hulls = (visual_hull(scene, frame, resolution=_RESOLUTION) for frame in range(scene.frame_count))

@@ -26,7 +26,8 @@ def velocities(network: DeformationNetwork, means: torch.Tensor, time: float, ca
     shutter = camera.shutter
     half = 0.5 * (shutter.exposure_time + abs(shutter.readout_time))
     end = (network.frame_count - 1) / network.fps
-    first, last = max(0.0, time - half), min(end, time + half)
+    middle = min(max(0.0, time), end)
+    first, last = max(0.0, middle - half), min(end, middle + half)
     moved = network.displacements(means, torch.tensor([first, last]))
     return (moved[1] - moved[0]) / (last - first)
 
