@@ -15,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.hull.carve import visual_hull
-from masiv.hull.velocity import with_velocities
 from masiv.hull.shadow_volume import remove_shadow_volume
+from masiv.hull.velocity import with_velocities
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.config import ReconstructConfig

@@ -8,8 +8,8 @@ import numpy as np
 
 from masiv.errors import MasivError
 from masiv.hull.carve import VisualHull, visual_hull
-from masiv.hull.velocity import with_velocities
 from masiv.hull.shadow_volume import remove_shadow_volume
+from masiv.hull.velocity import with_velocities
 from masiv.scene.scene import Scene
 
 
