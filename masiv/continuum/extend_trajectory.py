@@ -10,7 +10,7 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.fill import FilledVolume, fill_volume
+from masiv.continuum.fill import FilledVolume, fill_later_frame
 from masiv.continuum.finetune import KnownMotion, fine_tune
 from masiv.continuum.trajectory import Trajectory, positions_at
 from masiv.errors import InputError, MasivError
@@ -55,7 +55,7 @@ def extend_trajectory(
     volumes = []
     for frame in range(known, scene.frame_count):
         progress("fill new frames", frame - known + 1, scene.frame_count - known)
-        volumes.append(fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=hull))
+        volumes.append(fill_later_frame(scene, dynamic, frame, config, start, hull))
     known_motion = KnownMotion(
         torch.from_numpy(trajectory.positions - trajectory.positions[0]),
         _initial_network(motion, dynamic.canonical.means.detach(), trajectory, seed),

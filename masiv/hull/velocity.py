@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from masiv.hull.carve import visual_hull
+from masiv.scene.gaps import interpolated
 from masiv.scene.scene import Scene
 
 _RESOLUTION = 24
@@ -23,6 +24,7 @@ def with_velocities(scene: Scene, positions: np.ndarray | None = None) -> Scene:
     if not any(scene.shows_other_times(view) for view in scene.views):
         return scene
     if positions is None:
-        hulls = (visual_hull(scene, frame, resolution=_RESOLUTION) for frame in range(scene.frame_count))
-        positions = np.stack([hull.points.mean(axis=0) for hull in hulls])
+        hulls = [visual_hull(scene, frame, resolution=_RESOLUTION) for frame in scene.observed_frames]
+        centroids = np.stack([hull.points.mean(axis=0) for hull in hulls])
+        positions = interpolated(scene.observed_frames, centroids, scene.frame_count)
     return replace(scene, velocities=np.gradient(positions, 1 / scene.fps, axis=0))

@@ -35,6 +35,7 @@ class Scene:
     hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
     velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for silhouettes of
     views that show other times than the frame's.
+    missing: (view, frame) of which there is no picture.
     time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
     """
 
@@ -55,6 +56,7 @@ class Scene:
     fit_frames: int | None = None
     velocities: np.ndarray | None = None
     time_offsets: tuple[float, ...] = ()
+    missing: frozenset[tuple[int, int]] = frozenset()
 
     def __post_init__(self) -> None:
         if not isinstance(self.load, FrameCache):
@@ -69,6 +71,13 @@ class Scene:
     def views(self) -> tuple[int, ...]:
         """Indices of the cameras that are not held out."""
         return tuple(v for v in range(len(self.cameras)) if v not in self.hidden_views)
+
+    @property
+    def observed_frames(self) -> tuple[int, ...]:
+        """Frames of which a camera that is not held out has a picture."""
+        if not self.missing:
+            return tuple(range(self.frame_count))
+        return tuple(k for k in range(self.frame_count) if any((v, k) not in self.missing for v in self.views))
 
     def time_offset(self, view: int) -> float:
         """Of the clock of ``view`` [s]."""
