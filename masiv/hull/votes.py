@@ -60,7 +60,7 @@ def vote(
     for k, view in enumerate(views):
         distance, inside_image, visible = view.distances(points)
         shown += inside_image
-        pixels, depth = view.camera.project(points[visible])
+        pixels, depth = view.project(points[visible])
         columns, rows = np.floor(pixels).astype(np.int64).T
         denied[visible, k] = (distance[visible] > tolerance) * view.confidence[rows, columns]
         side = _cell_side(view, depth, spacing)
