@@ -155,7 +155,6 @@ class _Fit:
         velocities = np.gradient(initial.base_motion, 1 / scene.fps, axis=0)[list(initial.frames)]
         surfaces = [hull.points[hull.surface] for hull in initial.hulls]
         surfaces = [points[:: max(1, len(points) // HULL_POINTS)] for points in surfaces]
-        shown = [float(image.mask.sum()) for of_frame in self.images for image in of_frame]
         return ImageFormation(
             [scene.cameras[view] for view in scene.views],
             scene.frame_count,
@@ -163,7 +162,6 @@ class _Fit:
             self.config.calibration,
             np.concatenate(surfaces),
             np.repeat(velocities, [len(points) for points in surfaces], axis=0),
-            float(np.mean(shown)),
         )
 
     @property
