@@ -84,6 +84,15 @@ def fill_volume(
     return FilledVolume(points, spacing, len(points) * spacing**3)
 
 
+def fill_later_frame(
+    scene: Scene, dynamic: DynamicGaussians, frame: int, config: TrajectoryConfig, start: FilledVolume, volume: float
+) -> FilledVolume | None:
+    """``fill_volume``, a little finer than ``start`` fills frame 0; None for a frame without a picture."""
+    if frame not in scene.observed_frames:
+        return None
+    return fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=volume)
+
+
 def density_field(
     scene: Scene,
     dynamic: DynamicGaussians | None,

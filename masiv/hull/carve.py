@@ -84,7 +84,7 @@ def occupancy(
     A voxel is above the ground, inside the image of at least two views and of half of them, and at most ``tolerance``
     [m] outside of every mask, except where the views outvote one of them: see ``masiv.hull.votes``.
     """
-    return consensus(views, vote(views, points, tolerance, ground, spacing), points, spacing)
+    return consensus(views, vote(views, points, tolerance, ground, spacing))
 
 
 def surface_of(occupied: np.ndarray) -> np.ndarray:

@@ -16,7 +16,9 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.hull.carve import visual_hull
 from masiv.hull.shadow_volume import remove_shadow_volume
+from masiv.hull.velocity import with_velocities
 from masiv.progress import Progress, silent
+from masiv.scene.gaps import interpolated
 from masiv.scene.scene import Scene
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
@@ -96,9 +98,14 @@ class _ExtensionFit:
             )
         new = range(self.known, self.count)
         self.iterations = math.ceil(extension.step_ratio * config.iterations / self.known * len(new))
-        self.images = dict(zip(new, observed_images(scene, config, new), strict=True))
+        self.observed = [frame for frame in scene.observed_frames if frame >= self.known]
+        if not self.observed:
+            raise InputError(f"{scene.path} has no picture of a frame from {self.known} on")
+        self.images = dict(zip(self.observed, observed_images(scene, config, self.observed), strict=True))
         progress("extend frames", 0, self.iterations, "carving hulls")
-        frames = range(self.known - 1, self.count)
+        last = max(frame for frame in scene.observed_frames if frame < self.known)
+        frames = [last, *self.observed]
+        scene = with_velocities(scene)
         first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
         hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
 
@@ -106,7 +113,7 @@ class _ExtensionFit:
         self.gaussians = _parameters(dynamic.canonical)
         self.pairs = neighbour_pairs(means.double().numpy(), config.neighbours)
         self.half_extent = known.settings["half_extent"]
-        hull_losses = {frame: HullLoss(hull) for frame, hull in zip(new, hulls[1:], strict=True)}
+        hull_losses = {frame: HullLoss(hull) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
         scale = float(dynamic.canonical.scales.mean())
         self.objective = Objective(
             config,
@@ -122,7 +129,9 @@ class _ExtensionFit:
         self.known_times = torch.arange(self.known) / scene.fps
         with torch.no_grad():
             self.known_changes = known.changes(means, self.known_times)
-        centroids = torch.tensor(np.stack([h.points.mean(axis=0) for h in hulls]), dtype=torch.float32)
+        centroids = np.stack([h.points.mean(axis=0) for h in hulls])
+        centroids = interpolated([frame - last for frame in frames], centroids, self.count - last)
+        centroids = torch.tensor(centroids[self.known - 1 - last :], dtype=torch.float32)
         settings = (config.model_dump(exclude={"processes"}), extension.model_dump())
         self.identity = repr((*settings, seed, str(scene.path), self.known, self.count, scene.views))
         resumed = state is not None and state["identity"] == self.identity
@@ -226,10 +235,11 @@ class _ExtensionFit:
 
     def _choose_images(self, rng: np.random.Generator) -> list[tuple[int, int]]:
         """(frame, index of its image). One shows the newest frame while frames are added, others a random new one."""
-        frames = rng.integers(self.known, self.frames, size=self.config.batch_size)
+        in_fit = [frame for frame in self.observed if frame < self.frames] or self.observed[:1]
+        chosen = rng.integers(len(in_fit), size=self.config.batch_size)
         if self.annealing == 0:
-            frames[0] = self.frames - 1
-        return [(int(f), int(rng.integers(len(self.images[int(f)])))) for f in frames]
+            chosen[0] = len(in_fit) - 1
+        return [(in_fit[k], int(rng.integers(len(self.images[in_fit[k]])))) for k in chosen]
 
 
 def _parameters(gaussians: Gaussians) -> dict[str, torch.Tensor]:

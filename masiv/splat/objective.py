@@ -16,6 +16,7 @@ from masiv.splat.image_formation import Corrections, ImageFormation
 from masiv.splat.losses import Pairs, ssim, strain
 from masiv.splat.observed_image import ObservedImage
 from masiv.splat.rasteriser import render
+from masiv.splat.shutter import expose, velocities
 
 PARAMETER_NAMES = ("means", "log_scales", "opacity_logits", "colour_logits")
 """The parameters of the Gaussians."""
@@ -153,11 +154,18 @@ class Objective:
             positions = means + displacements[k]
             if corrected is not None:
                 positions = corrected.positions(observed.view, positions)
-            drawn = render(observed.camera, positions, scales, opacities, colours, background)
-            rgb = drawn.rgb
+            if observed.camera.shutter.is_instant:
+                drawn = render(observed.camera, positions, scales, opacities, colours, background)
+                rgb, alpha = drawn.rgb, drawn.alpha
+            else:
+                velocity = velocities(network, means.detach(), float(moments.times[k].detach()), observed.camera)
+                if corrected is not None:  # the corrections are an affine map
+                    ahead = corrected.positions(observed.view, means + displacements[k] + velocity)
+                    velocity = ahead - positions
+                rgb, alpha = expose(observed.camera, positions, velocity, scales, opacities, colours, background)
             if corrected is not None:
-                rgb = corrected.rgb(observed.view, frame, rgb, drawn.alpha, background)
-            image_losses.append(self._image_loss(rgb, drawn.alpha, observed, background))
+                rgb = corrected.rgb(observed.view, frame, rgb, alpha, background)
+            image_losses.append(self._image_loss(rgb, alpha, observed, background))
             loss = loss + image_losses[-1] / part.image_count
         if part.scale_term and formation is not None and corrected is not None:
             level = torch.stack(image_losses).detach().mean()
