@@ -14,6 +14,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.progress import silent
 from masiv.scene.calibration import NO_CORRECTION, Calibration, CameraCorrection, corrected_camera
+from masiv.scene.shutter import Shutter
 from masiv.splat.config import CalibrationConfig
 from masiv.splat.image_formation import ImageFormation, displacement_jacobian, rotate
 from masiv.splat.objective import Objective, Part
@@ -232,7 +233,14 @@ def test_calibration_round_trip_and_scenes_that_it_applies_to(tmp_path):
 
     refined = again.applied_to(scene)
     np.testing.assert_array_equal(refined.cameras[1].intrinsics, made.refined[1].intrinsics)
-    assert again.applied_to(refined).cameras == refined.cameras
+    twice = again.applied_to(refined)
+    np.testing.assert_array_equal(twice.cameras[1].world_to_camera, refined.cameras[1].world_to_camera)
+    assert twice.time_offsets == refined.time_offsets == made.time_offsets
+    slow = Shutter.of_image(0.01, 0.02, scene.cameras[1].height)
+    rolling = dataclasses.replace(
+        scene, cameras=tuple(dataclasses.replace(camera, shutter=slow) for camera in scene.cameras)
+    )
+    assert again.applied_to(rolling).cameras[1].shutter == slow
     other = dataclasses.replace(scene, cameras=scene.cameras[::-1])
     with pytest.raises(InputError, match="not those that were refined"):
         again.applied_to(other)

@@ -51,7 +51,7 @@ def corrected_camera(camera: Camera, correction: CameraCorrection, pivot: np.nda
     pose[:3, 3] = rotation @ (given[:3, 3] - centre) + centre + correction.translation
     intrinsics = np.array(camera.intrinsics, np.float64)
     intrinsics[:2, :2] *= np.exp(correction.log_focal)
-    return Camera(camera.name, camera.width, camera.height, intrinsics, pose)
+    return replace(camera, intrinsics=intrinsics, world_to_camera=pose)
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,13 @@ class Calibration:
 
         Raises InputError if its cameras are others than those that were refined.
         """
-        if scene.cameras is self.refined:
-            return scene
         for known in (self.given, self.refined):
             if len(known) == len(scene.cameras) and all(map(_same, known, scene.cameras)):
-                return replace(scene, cameras=self.refined, time_offsets=self.time_offsets)
+                cameras = tuple(
+                    replace(camera, intrinsics=new.intrinsics, world_to_camera=new.world_to_camera)
+                    for camera, new in zip(scene.cameras, self.refined, strict=True)
+                )
+                return replace(scene, cameras=cameras, time_offsets=self.time_offsets)
         raise InputError(
             f"{scene.path}: the cameras are not those that were refined ({len(self.given)} cameras): give the scene of "
             "the run, or reconstruct it anew"
@@ -132,6 +134,7 @@ class Calibration:
 
 
 def _same(one: Camera, other: Camera) -> bool:
+    """But for the shutter, which scene.yaml says and no fit changes."""
     return (
         (one.name, one.width, one.height) == (other.name, other.width, other.height)
         and np.array_equal(one.intrinsics, other.intrinsics)
