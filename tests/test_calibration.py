@@ -226,6 +226,8 @@ def test_calibration_round_trip_and_scenes_that_it_applies_to(tmp_path):
     assert again.time_offsets == made.time_offsets == (0, CORRECTION.time_offset, 0, 0, 0, 0, 0)
     assert again.displacement_px == made.displacement_px
     assert made.displacement_px[1] > 0.5
+    assert f"{made.displacement_px[1]:.2f} px for {scene.cameras[1].name}; clocks by 4.0 ms" in made.text()
+    assert made.summary()[1]["focal_factor"] == pytest.approx(np.exp(CORRECTION.log_focal))
     assert made.refined[3] is made.given[3]
     row = json.loads((tmp_path / "calibration.json").read_text())["cameras"][1]
     np.testing.assert_allclose(np.radians(row["rotation_deg"]), CORRECTION.rotation, atol=1e-9)

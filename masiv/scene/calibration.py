@@ -107,6 +107,28 @@ class Calibration:
             "the run, or reconstruct it anew"
         )
 
+    def summary(self) -> list[dict[str, Any]]:
+        """A row for each camera: name, displacement_px, focal_factor, time_offset_s."""
+        rows = zip(self.given, self.refined, self.time_offsets, self.displacement_px, strict=True)
+        return [
+            {
+                "name": given.name,
+                "displacement_px": displacement,
+                "focal_factor": float(refined.intrinsics[0, 0] / given.intrinsics[0, 0]),
+                "time_offset_s": offset,
+            }
+            for given, refined, offset, displacement in rows
+        ]
+
+    def text(self) -> str:
+        """One sentence: by how much the cameras were corrected."""
+        largest = int(np.argmax(self.displacement_px))
+        rms = float(np.sqrt(np.mean(np.square(self.displacement_px))))
+        return (
+            f"cameras refined: {rms:.2f} px on average in their pictures, {self.displacement_px[largest]:.2f} px for "
+            f"{self.given[largest].name}; clocks by {1e3 * max(map(abs, self.time_offsets)):.1f} ms at most"
+        )
+
     def save(self, folder: Path) -> None:
         """Write calibration.json into ``folder``."""
         rows = zip(self.given, self.refined, self.time_offsets, self.displacement_px, strict=True)
