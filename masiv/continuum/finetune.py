@@ -184,9 +184,7 @@ class _TrajectoryLoss:
         return terms
 
 
-def chamfer_targets(
-    moved: np.ndarray, volumes: Sequence[FilledVolume | None], start: FilledVolume
-) -> ChamferTargets:
+def chamfer_targets(moved: np.ndarray, volumes: Sequence[FilledVolume | None], start: FilledVolume) -> ChamferTargets:
     """Chamfer pairs between particles ``moved`` (T, Q, 3) [m] and the T ``volumes``.
 
     mean_i |x_i - v(x_i)|² + mean_j |v_j - x(v_j)|², v(x) and x(v) being nearest neighbours. Pairs nearer than 0.8

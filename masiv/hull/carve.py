@@ -48,14 +48,32 @@ def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull
             f"frame {frame} of {scene.path}: the object is in the mask of {len(occupied_views)} of {len(views)} views, "
             "a visual hull needs 2; check the masks of that frame"
         )
+    grid = occupancy_grid(views, scene, frame, resolution)
+    occupied = occupancy(views, grid.points, 0.25 * grid.spacing, grid.spacing, scene.ground).reshape(grid.counts)
+    if not occupied.any():
+        raise MasivError(_no_volume(views, occupied_views, scene, frame))
+    return VisualHull(grid.points[occupied.ravel()], grid.spacing, surface_of(occupied)[occupied])
+
+
+@dataclass(frozen=True)
+class OccupancyGrid:
+    """Voxels around the object: centres ``points`` (N, 3) [m] of ``counts`` (3,) voxels with side ``spacing`` [m]."""
+
+    points: np.ndarray
+    spacing: float
+    counts: np.ndarray
+
+
+def occupancy_grid(views: tuple[Silhouette, ...], scene: Scene, frame: int, resolution: int) -> OccupancyGrid:
+    """The grid of the hull's bounding box, whose longest side has ``resolution`` voxels.
+
+    Raises MasivError if the box is empty.
+    """
+    occupied_views = [view for view in views if (view.distance < 0).any()]
     lower, upper = _object_box(views, occupied_views, scene.ground, frame, scene)
     spacing = float((upper - lower).max()) / resolution
     counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
-    grid = _cell_centres(lower, spacing, counts)
-    occupied = occupancy(views, grid, 0.25 * spacing, spacing, scene.ground).reshape(counts)
-    if not occupied.any():
-        raise MasivError(_no_volume(views, occupied_views, scene, frame))
-    return VisualHull(grid[occupied.ravel()], spacing, surface_of(occupied)[occupied])
+    return OccupancyGrid(_cell_centres(lower, spacing, counts), spacing, counts)
 
 
 def occupancy(
@@ -66,7 +84,7 @@ def occupancy(
     A voxel is above the ground, inside the image of at least two views and of half of them, and at most ``tolerance``
     [m] outside of every mask, except where the views outvote one of them: see ``masiv.hull.votes``.
     """
-    return consensus(views, vote(views, points, tolerance, ground, spacing), points, spacing)
+    return consensus(views, vote(views, points, tolerance, ground, spacing))
 
 
 def surface_of(occupied: np.ndarray) -> np.ndarray:

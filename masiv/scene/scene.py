@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,11 +34,12 @@ class Scene:
     Frames are 0 … frame_count-1, at the times frame / fps. gravity (3,) [m/s²]; up (3,) unit vector; density [kg/m³].
     ``load(view, frame)`` reads a picture and keeps those that were read last (``FrameCache``); ``frame(view, frame)``
     also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
-    hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
-    velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for silhouettes of
-    views that show other times than the frame's.
-    missing: (view, frame) of which there is no picture.
-    time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
+    mask_source: where masks come from, for messages. masks_estimated: from colours, none was given.
+    correct_masks: makes the masks of the views of one frame agree, see ``masiv.hull.consistent_masks``; None for masks
+    that are given. hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences
+    for the user. velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for
+    silhouettes of views that show other times than the frame's. time_offsets [s]: of the cameras' clocks, empty if all
+    are exact. A picture was taken at frame / fps + offset. missing: (view, frame) of which there is no picture.
     """
 
     path: Path
@@ -50,8 +53,10 @@ class Scene:
     density: float
     load: Callable[[int, int], Frame]
     mask_source: str
+    masks_estimated: bool = False
     background: Callable[[int], np.ndarray | None] = _unknown_background
     problems: tuple[str, ...] = ()
+    correct_masks: Callable[[Scene, int], Mapping[int, Frame]] | None = None
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
     velocities: np.ndarray | None = None
@@ -61,6 +66,10 @@ class Scene:
     def __post_init__(self) -> None:
         if not isinstance(self.load, FrameCache):
             object.__setattr__(self, "load", FrameCache(self.load))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickled without corrected masks: another process makes those that it needs."""
+        return {name: value for name, value in self.__dict__.items() if name != "_corrected"}
 
     @property
     def times(self) -> np.ndarray:
@@ -87,6 +96,11 @@ class Scene:
         """Whether pixels of ``view`` show other times than that of their frame: rolling shutter, clock."""
         return self.cameras[view].shutter.readout_time != 0 or self.time_offset(view) != 0
 
+    @property
+    def view_time_offsets(self) -> tuple[float, ...]:
+        """``time_offsets`` [s] of ``views``; empty if all clocks are exact."""
+        return tuple(self.time_offsets[view] for view in self.views) if any(self.time_offsets) else ()
+
     def frame(self, view: int, frame: int) -> Frame:
         """The picture of ``view`` at ``frame``; ``valid`` is False everywhere if there is none.
 
@@ -94,7 +108,19 @@ class Scene:
         """
         if not 0 <= frame < self.frame_count or view not in self.views:
             raise InputError(f"view {view}, frame {frame} of {self.path} is held out from this stage or does not exist")
-        return self.load(view, frame)
+        return self.load(view, frame) if self.correct_masks is None else self._corrected(view, frame)
+
+    @cached_property
+    def _corrected(self) -> FrameCache:
+        def corrected(view: int, frame: int) -> Frame:
+            assert self.correct_masks is not None
+            found = self.correct_masks(replace(self, correct_masks=None), frame)
+            for other, picture in found.items():
+                cache.put(other, frame, picture)
+            return found[view]
+
+        cache = FrameCache(corrected)
+        return cache
 
     def restricted(self, fit_frames: int | None = None, holdout_cameras: tuple[int, ...] = ()) -> Scene:
         """The first ``fit_frames`` frames (None: all) without ``holdout_cameras``: the training data of a fit.

@@ -58,6 +58,8 @@ def extend_frames(
 ) -> DynamicGaussians:
     """``dynamic``, fitted to the first frames of ``scene``, with a motion over all frames.
 
+    Cameras are not refined further: ``scene`` has those that were refined with ``dynamic``, and their clocks.
+
     A new network is first fitted to the known motion, without images. Then the new frames are added one after the
     other, as in ``reconstruct``, with a loss that keeps the known motion. Needs ``masiv.runtime.start``.
     Raises InputError if ``scene`` has no further frame, MasivError if a frame does not show the object or the fit
@@ -113,7 +115,16 @@ class _ExtensionFit:
         self.half_extent = known.settings["half_extent"]
         hull_losses = {frame: HullLoss(hull) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
         scale = float(dynamic.canonical.scales.mean())
-        self.objective = Objective(config, scale, self.half_extent, scene.fps, scene.ground, hull_losses, self.images)
+        self.objective = Objective(
+            config,
+            scale,
+            self.half_extent,
+            scene.fps,
+            scene.ground,
+            hull_losses,
+            self.images,
+            scene.view_time_offsets,
+        )
 
         self.known_times = torch.arange(self.known) / scene.fps
         with torch.no_grad():

@@ -81,7 +81,14 @@ class _Fit:
         self.half_extent = initial.half_extent
         hulls = {frame: HullLoss(hull) for frame, hull in zip(initial.frames, initial.hulls, strict=True)}
         self.objective = Objective(
-            config, initial.scale, initial.half_extent, scene.fps, scene.ground, hulls, self.images
+            config,
+            initial.scale,
+            initial.half_extent,
+            scene.fps,
+            scene.ground,
+            hulls,
+            self.images,
+            scene.view_time_offsets,
         )
         self.formation = self._image_formation(initial) if config.refine_calibration else None
         if state is not None and state["identity"] == self.identity:
@@ -231,6 +238,8 @@ class _Fit:
             for group in self.optimiser.param_groups:
                 if group["name"] == "means" or (group["name"] == "colour_logits" and self.annealing == 0):
                     group["lr"] *= c.canonical_rate_factor
+                if group["name"] == "cameras" and self.annealing == 0:
+                    group["lr"] *= c.calibration.growth_rate_factor
         parts = self.objective.parts(len(self.parameters["means"]), chosen, 1 - self.annealing, rng)
         value = self._compute_gradients(parts)
         if not np.isfinite(value):
