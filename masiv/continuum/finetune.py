@@ -141,7 +141,7 @@ class _TrajectoryLoss:
         first = 1 if known is None else len(known.displacements)
         self.known_times = torch.as_tensor(scene.times[:first], dtype=torch.float32)
         self.times = torch.as_tensor(scene.times[first:], dtype=torch.float32)
-        self.views = load_views(scene)[first:]
+        self.views = load_views(scene, first)
         opaque = dynamic.canonical.opacities.detach().reshape(-1) > 0.1
         self.anchors = dynamic.canonical.means.detach()[opaque]
         guide = dynamic.deformation if known is None else known.network
@@ -165,7 +165,7 @@ class _TrajectoryLoss:
         square = 1 / self.spacing**2
         chamfer = (positions - targets.targets[:, batch]).square().sum(-1) * targets.weights[:, batch]
         outside = [
-            outside_of_mask(at_frame, views[rng.integers(len(views))])
+            outside_of_mask(at_frame, views[int(rng.integers(len(views)))])
             for at_frame, views in zip(positions, self.views, strict=True)
         ]
         terms = {
