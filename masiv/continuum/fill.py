@@ -16,6 +16,7 @@ from scipy import ndimage
 from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import MasivError
 from masiv.hull.carve import visual_hull
+from masiv.hull.depth import depth_views
 from masiv.hull.shadow_volume import remove_shadow_volume
 from masiv.hull.silhouette import sample_bilinear, silhouettes
 from masiv.scene.camera import Camera
@@ -105,10 +106,13 @@ def density_field(
     index = np.rint((hull.points - lower) / spacing).astype(int)
     density = np.zeros(index.max(axis=0) + 1 + margin, np.float32)
     outside = np.full(len(hull.points), -np.inf)
-    for view in silhouettes(scene, frame):
+    views = silhouettes(scene, frame)
+    for view in views:
         distance, _, visible = view.distances(hull.points)
         outside = np.maximum(outside, np.where(visible, distance, -np.inf))
-    # A voxel at the edge of a silhouette has the density of the part that is inside.
+    for depth in depth_views(scene, frame, views):
+        outside = np.maximum(outside, np.maximum(depth.outside(hull.points), depth.behind(hull.points)))
+    # A voxel at the edge of a silhouette, or at a measured surface, has the density of the part that is inside.
     filled = np.clip(0.5 - outside / spacing, 0.0, 1.0)
     if dynamic is not None:
         filled[in_front_of_surface(scene, dynamic, frame, hull.points, config.depth_tolerance * spacing)] = 0.0

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from masiv.errors import InputError
+from masiv.scene.depth import DepthNoise
 from masiv.scene.scene import Ground
 from masiv.strict import read_yaml, validated
 
@@ -24,12 +25,25 @@ class GroundDeclaration(BaseModel):
     height: FiniteFloat = 0.0
 
 
+class DepthNoiseDeclaration(BaseModel):
+    """See ``masiv.scene.depth.DepthNoise``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    constant: Annotated[FiniteFloat, Field(gt=0)] = DepthNoise().constant
+    quadratic: Annotated[FiniteFloat, Field(ge=0)] = DepthNoise().quadratic
+
+    def noise(self) -> DepthNoise:
+        """As the readers and stages take it."""
+        return DepthNoise(self.constant, self.quadratic)
+
+
 class SceneDeclaration(BaseModel):
     """Keys of ``scene.yaml``. A missing key has the default of the layout.
 
     fps: frames per second. up_axis: x, y, z, with a minus sign, or three numbers. gravity: three numbers [m/s²], or one
     magnitude along −up. ground: `none` or {normal, height}. density [kg/m³]. crop_box: two opposite corners [m, world];
-    masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given.
+    masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given. depth_unit: of the steps
+    of depth pictures [m]. depth_noise: standard deviation of a depth z, constant [m] + quadratic [1/m] z².
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -40,6 +54,8 @@ class SceneDeclaration(BaseModel):
     density: Annotated[FiniteFloat, Field(gt=0)] | None = None
     crop_box: tuple[Vector, Vector] | None = None
     fit_frames: Annotated[int, Field(ge=2)] | None = None
+    depth_unit: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    depth_noise: DepthNoiseDeclaration | None = None
 
     @field_validator("up_axis", mode="before")
     @classmethod

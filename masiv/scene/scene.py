@@ -10,6 +10,8 @@ import numpy as np
 
 from masiv.errors import InputError
 from masiv.scene.camera import Camera
+from masiv.scene.cloud import Cloud
+from masiv.scene.depth import DepthNoise
 from masiv.scene.frame_cache import Frame, FrameCache
 
 
@@ -33,6 +35,8 @@ class Scene:
     ``load(view, frame)`` reads a picture and keeps those that were read last (``FrameCache``); ``frame(view, frame)``
     also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
     hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
+    depth_noise: None if the pictures have no depth. ``load_cloud(frame)``: for a recording of point clouds, which has
+    no cameras; ``cloud(frame)`` also checks that this scene contains it.
     """
 
     path: Path
@@ -50,6 +54,8 @@ class Scene:
     problems: tuple[str, ...] = ()
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
+    depth_noise: DepthNoise | None = None
+    load_cloud: Callable[[int], Cloud] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.load, FrameCache):
@@ -74,6 +80,12 @@ class Scene:
             raise InputError(f"view {view}, frame {frame} of {self.path} is held out from this stage or does not exist")
         return self.load(view, frame)
 
+    def cloud(self, frame: int) -> Cloud:
+        """The point cloud of ``frame``. Raises InputError if the frame is held out, or the recording has no clouds."""
+        if self.load_cloud is None or not 0 <= frame < self.frame_count:
+            raise InputError(f"frame {frame} of {self.path} has no point cloud that this stage may see")
+        return self.load_cloud(frame)
+
     def restricted(self, fit_frames: int | None = None, holdout_cameras: tuple[int, ...] = ()) -> Scene:
         """The first ``fit_frames`` frames (None: all) without ``holdout_cameras``: the training data of a fit.
 
@@ -88,6 +100,6 @@ class Scene:
             if not 0 <= view < len(self.cameras):
                 raise InputError(f"--holdout-camera {view}: the scene has cameras 0 to {len(self.cameras) - 1}")
         hidden = tuple(sorted({*self.hidden_views, *holdout_cameras}))
-        if len(hidden) >= len(self.cameras):
+        if self.cameras and len(hidden) >= len(self.cameras):
             raise InputError("--holdout-camera leaves no camera to train on")
         return replace(self, frame_count=count, hidden_views=hidden)

@@ -12,7 +12,7 @@ from masiv.scene.scene import Ground
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.hull_loss import HullLoss
-from masiv.splat.losses import Pairs, ssim, strain
+from masiv.splat.losses import Pairs, depth_distance, ssim, strain
 from masiv.splat.observed_image import ObservedImage
 from masiv.splat.rasteriser import render
 
@@ -126,6 +126,9 @@ class Objective:
             scales = (gaussians["log_scales"] + log_changes[k]).exp()
             drawn = render(observed.camera, means + displacements[k], scales, opacities, colours, background)
             loss = loss + self._image_loss(drawn.rgb, drawn.alpha, observed, background) / part.image_count
+            if observed.depth is not None and c.depth_weight > 0:
+                distance = depth_distance(drawn.depth, drawn.alpha, observed.depth)
+                loss = loss + c.depth_weight * distance / (self.half_extent * part.image_count)
         return loss
 
     def _regularization(
