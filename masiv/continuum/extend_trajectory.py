@@ -10,11 +10,10 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.fill import FilledVolume, fill_volume
+from masiv.continuum.fill import FilledVolume, fill_volume, hull_volume
 from masiv.continuum.finetune import KnownMotion, fine_tune
 from masiv.continuum.trajectory import Trajectory, positions_at
 from masiv.errors import InputError, MasivError
-from masiv.hull.carve import visual_hull
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
@@ -49,7 +48,7 @@ def extend_trajectory(
             f"{known}: give the scene and the motion of the same frames, more than the trajectory has"
         )
     start = FilledVolume(trajectory.positions[0].astype(np.float64), trajectory.spacing, trajectory.volume)
-    hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
+    hull = hull_volume(scene, config)
     volumes = []
     for frame in range(known, scene.frame_count):
         progress("fill new frames", frame - known + 1, scene.frame_count - known)

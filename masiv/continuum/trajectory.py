@@ -16,11 +16,11 @@ import torch
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.consistency import consistent_particles
-from masiv.continuum.fill import FilledVolume, density_field, even_points, fill_volume
+from masiv.continuum.density_field import even_points
+from masiv.continuum.fill import FilledVolume, density_field, fill_volume, hull_volume
 from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
 from masiv.files import write_npz
-from masiv.hull.carve import visual_hull
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
@@ -94,7 +94,7 @@ def estimate_trajectory(
     """
     checkpoint = checkpoint or Checkpoint(None)
     start = fill_first_frame(scene, dynamic, config)
-    hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
+    hull = hull_volume(scene, config)
     volumes = []
     for frame in range(1, scene.frame_count):
         progress("fill", frame, scene.frame_count - 1)

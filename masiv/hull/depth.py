@@ -143,6 +143,10 @@ def _without_holes(depth: np.ndarray, on_object: np.ndarray) -> np.ndarray:
 
 
 def _guessed_back(view: Silhouette, on_object: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Depth (H, W) [m] of the hidden side: the seen surface plus the thickness of a body as deep as it is wide."""
-    metres_per_pixel = depth / view.camera.intrinsics[0, 0]
-    return np.where(on_object & (depth > 0), depth + local_thickness(on_object) * metres_per_pixel, 0.0)
+    """Depth (H, W) [m] of the hidden side: the seen surface plus the thickness of a body as deep as it is wide.
+
+    A thickness of t pixels is measured half-way between front and back: T = t (z + T / 2) / f.
+    """
+    pixels = local_thickness(on_object)
+    thickness = pixels * depth / np.maximum(view.camera.intrinsics[0, 0] - 0.5 * pixels, 1.0)
+    return np.where(on_object & (depth > 0), depth + thickness, 0.0)

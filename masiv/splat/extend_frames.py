@@ -18,6 +18,7 @@ from masiv.hull.carve import visual_hull
 from masiv.hull.shadow_volume import remove_shadow_volume
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
+from masiv.splat.clouds import centroid, cloud_objective
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
@@ -94,24 +95,15 @@ class _ExtensionFit:
             )
         new = range(self.known, self.count)
         self.iterations = math.ceil(extension.step_ratio * config.iterations / self.known * len(new))
-        self.images = dict(zip(new, observed_images(scene, config, new), strict=True))
-        progress("extend frames", 0, self.iterations, "carving hulls")
-        frames = range(self.known - 1, self.count)
-        first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
-        hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
-
         means = dynamic.canonical.means.detach()
         self.gaussians = _parameters(dynamic.canonical)
         self.pairs = neighbour_pairs(means.double().numpy(), config.neighbours)
         self.half_extent = known.settings["half_extent"]
-        hull_losses = {frame: HullLoss(hull) for frame, hull in zip(new, hulls[1:], strict=True)}
-        scale = float(dynamic.canonical.scales.mean())
-        self.objective = Objective(config, scale, self.half_extent, scene.fps, scene.ground, hull_losses, self.images)
+        centroids = self._observe(scene, float(dynamic.canonical.scales.mean()), progress)
 
         self.known_times = torch.arange(self.known) / scene.fps
         with torch.no_grad():
             self.known_changes = known.changes(means, self.known_times)
-        centroids = torch.tensor(np.stack([h.points.mean(axis=0) for h in hulls]), dtype=torch.float32)
         settings = (config.model_dump(exclude={"processes"}), extension.model_dump())
         self.identity = repr((*settings, seed, str(scene.path), self.known, self.count, scene.views))
         resumed = state is not None and state["identity"] == self.identity
@@ -120,6 +112,23 @@ class _ExtensionFit:
             self.iteration = state["iteration"]
             self.network.load_state_dict(state["network"])
             self.optimiser.load_state_dict(state["optimiser"])
+
+    def _observe(self, scene: Scene, scale: float, progress: Progress) -> torch.Tensor:
+        """Set the objective and ``images`` of the new frames; returns centroids (K, 3) [m] from the last known frame
+        on."""
+        config, new, frames = self.config, range(self.known, self.count), range(self.known - 1, self.count)
+        if scene.load_cloud is not None:
+            self.objective = cloud_objective(scene, config, new, config.gaussians, scale, self.half_extent)
+            self.images = self.objective.images
+            found = [centroid(scene.cloud(frame).points) for frame in frames]
+            return torch.tensor(np.stack(found), dtype=torch.float32)
+        self.images = dict(zip(new, observed_images(scene, config, new), strict=True))
+        progress("extend frames", 0, self.iterations, "carving hulls")
+        first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
+        hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
+        losses = {frame: HullLoss(hull) for frame, hull in zip(new, hulls[1:], strict=True)}
+        self.objective = Objective(config, scale, self.half_extent, scene.fps, scene.ground, losses, self.images)
+        return torch.tensor(np.stack([h.points.mean(axis=0) for h in hulls]), dtype=torch.float32)
 
     def _begin(self, known: DeformationNetwork, centroids: torch.Tensor, *, pretrain: bool) -> None:
         """A network of all frames. ``centroids`` of the hulls, from the last known frame on, extend the base motion."""

@@ -14,6 +14,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.progress import Progress
 from masiv.scene.scene import Scene
+from masiv.splat.clouds import cloud_objective, for_clouds, initial_from_clouds
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.data_parallel import GradientWorker, gradients, parameters
 from masiv.splat.deformation import DeformationNetwork
@@ -34,6 +35,7 @@ def reconstruct(
     """Fit Gaussians at frame 0 and their motion to all frames of ``scene``; held-out views are not used.
 
     Frames are added one after the other. Each starts from the extrapolated motion, so that material points are tracked.
+    Of point clouds, the Gaussians are points of the first one and the motion registers them to the others.
     Needs ``masiv.runtime.start``. Raises MasivError if a frame does not show the object or the fit diverges.
     The last state stays in ``checkpoint``: clear it after the result is saved.
     """
@@ -63,24 +65,41 @@ class _Fit:
         progress: Progress,
         worker: GradientWorker | None = None,
     ) -> None:
-        self.config, self.seed, self.scene, self.worker = config, seed, scene, worker
-        self.images = observed_images(scene, config, range(scene.frame_count))
+        self.config = config if scene.load_cloud is None else for_clouds(config)
+        self.seed, self.scene, self.worker = seed, scene, worker
         self.identity = repr(
             (config.model_dump(exclude={"processes"}), seed, str(scene.path), scene.frame_count, scene.views)
         )
-        progress("reconstruct", 0, config.iterations, "carving hulls")
-        initial = initial_gaussians(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
+        initial = self._observe(progress)
         self.half_extent = initial.half_extent
-        hulls = tuple(HullLoss(hull) for hull in initial.hulls)
-        self.objective = Objective(
-            config, initial.scale, initial.half_extent, scene.fps, scene.ground, hulls, self.images
-        )
         if state is not None and state["identity"] == self.identity:
             self._resume(state)
         else:
             self._begin(initial)
         if worker is not None:
             worker.configure(self.objective, self.network, len(self.parameters["means"]))
+
+    def _observe(self, progress: Progress) -> InitialGaussians:
+        """Set the objective, ``images`` by frame and their number; returns the start of the fit."""
+        scene, config = self.scene, self.config
+        if scene.load_cloud is not None:
+            progress("reconstruct", 0, config.iterations, "reading point clouds")
+            initial = initial_from_clouds(scene, config.gaussians)
+            self.objective = cloud_objective(
+                scene, config, range(scene.frame_count), config.gaussians, initial.scale, initial.half_extent
+            )
+            self.images = self.objective.images
+            return initial
+        self.images = observed_images(scene, config, range(scene.frame_count))
+        progress("reconstruct", 0, config.iterations, "carving hulls")
+        initial = initial_gaussians(
+            scene, config.gaussians, config.hull_resolution, np.random.default_rng((self.seed, 0))
+        )
+        hulls = tuple(HullLoss(hull) for hull in initial.hulls)
+        self.objective = Objective(
+            config, initial.scale, initial.half_extent, scene.fps, scene.ground, hulls, self.images
+        )
+        return initial
 
     def _begin(self, initial: InitialGaussians) -> None:
         self.iteration = 0
@@ -235,7 +254,7 @@ class _Fit:
         for group, name in zip(self.optimiser.param_groups, PARAMETER_NAMES, strict=False):
             old = self.parameters[name]
             new = old.detach()[keep].clone().requires_grad_()
-            moments = self.optimiser.state.pop(old)
+            moments = self.optimiser.state.pop(old, {})  # none if the objective does not depend on it
             self.optimiser.state[new] = {k: v[keep] if v.shape == old.shape else v for k, v in moments.items()}
             group["params"] = [new]
             self.parameters[name] = new
