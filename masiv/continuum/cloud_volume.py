@@ -21,8 +21,8 @@ _RADII = np.geomspace(1.0, 6.0, 12)
 _CLOSED = 0.9
 """r closes the cloud if it encloses this share of the largest volume that any r encloses."""
 _LEAST_ENCLOSED = 0.25
-"""Enclosed voxels over occupied cells of the surface. A closed sheet one voxel thick has about a half, the pockets of an
-open one nearly none."""
+"""Enclosed voxels over occupied cells of the surface. A closed sheet one voxel thick has about a half, the pockets of
+an open one nearly none."""
 _PLANES, _NORMAL_NEIGHBOURS = 8, 12
 """Tangent planes that are averaged at a voxel, and points that one is fitted to."""
 _SHARE_ROUNDS = 6

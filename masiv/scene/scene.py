@@ -96,6 +96,8 @@ class Scene:
             raise InputError(
                 f"--fit-frames {count}: the scene has {self.frame_count} frames, give 2 to {self.frame_count}"
             )
+        if holdout_cameras and not self.cameras:
+            raise InputError(f"--holdout-camera {holdout_cameras[0]}: {self.path} has point clouds and no cameras")
         for view in holdout_cameras:
             if not 0 <= view < len(self.cameras):
                 raise InputError(f"--holdout-camera {view}: the scene has cameras 0 to {len(self.cameras) - 1}")
