@@ -13,6 +13,7 @@ from .options import (
     FitFramesOption,
     HoldoutOption,
     JsonOption,
+    KeepCalibrationOption,
     PresetOption,
     SceneArgument,
     SeedOption,
@@ -54,6 +55,7 @@ def identify(
     ] = False,
     fit_frames: FitFramesOption = None,
     holdout: HoldoutOption = None,
+    keep_calibration: KeepCalibrationOption = False,
     config: ConfigOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
@@ -80,7 +82,7 @@ def identify(
         "geometry_loss": geometry_loss,
         "pictures": 0 if no_silhouette else None,
     }
-    request = SceneRequest(fit_frames, tuple(holdout or ()), asked, no_silhouette)
+    request = SceneRequest(fit_frames, tuple(holdout or ()), asked, no_silhouette, keep_calibration)
     run = open_run(scene, out, overrides(preset, config, seed, arch), request)
     with progress_bar() as progress:
         result = run.identify(progress)

@@ -27,6 +27,9 @@ FitFramesOption = Annotated[
 HoldoutOption = Annotated[
     list[int] | None, typer.Option("--holdout-camera", help="Keep camera K out of training; may be repeated.")
 ]
+KeepCalibrationOption = Annotated[
+    bool, typer.Option("--keep-calibration", help="Keep the cameras as given, instead of refining them.")
+]
 
 
 def overrides(preset: str | None, config: Path | None, seed: int | None, arch: str | None) -> Overrides:

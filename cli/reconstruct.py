@@ -13,6 +13,7 @@ from .options import (
     FitFramesOption,
     HoldoutOption,
     JsonOption,
+    KeepCalibrationOption,
     PresetOption,
     SceneArgument,
     SeedOption,
@@ -25,6 +26,7 @@ def reconstruct(
     out: Annotated[Path, typer.Option("--out", help="Run folder, new or to go on with.", show_default=False)],
     fit_frames: FitFramesOption = None,
     holdout: HoldoutOption = None,
+    keep_calibration: KeepCalibrationOption = False,
     config: ConfigOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
@@ -39,7 +41,7 @@ def reconstruct(
 
     from .console import progress_bar
 
-    request = SceneRequest(fit_frames, tuple(holdout or ()))
+    request = SceneRequest(fit_frames, tuple(holdout or ()), keep_calibration=keep_calibration)
     run = open_run(scene, out, overrides(preset, config, seed, arch), request)
     with progress_bar() as progress:
         result = run.reconstruct(progress)

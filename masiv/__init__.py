@@ -15,6 +15,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from masiv.api import (
+        calibrated,
         estimate_trajectory,
         evaluate,
         identify,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     **dict.fromkeys(
         (
+            "calibrated",
             "estimate_trajectory",
             "evaluate",
             "identify",
@@ -58,6 +60,7 @@ __all__ = [
     "SceneRequest",
     "SimulateRequest",
     "Twin",
+    "calibrated",
     "estimate_trajectory",
     "evaluate",
     "identify",

@@ -6,6 +6,7 @@ Example:
     scene = masiv.read_scene("assets/sample")
     config = masiv.load_config("quick")
     gaussians = masiv.reconstruct(scene, config)
+    scene = masiv.calibrated(scene, gaussians)
     trajectory = masiv.estimate_trajectory(scene, gaussians, config)
     twin = masiv.identify(scene, trajectory, config)
     result, twin = masiv.refine(scene, twin, trajectory, config)
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from masiv.twin import Twin
 
 __all__ = [
+    "calibrated",
     "estimate_trajectory",
     "evaluate",
     "identify",
@@ -61,8 +63,9 @@ def read_scene(path: str | Path) -> Scene | Tracks:
 def reconstruct(scene: Scene, config: Config | None = None, *, progress: Progress = silent) -> DynamicGaussians:
     """Dynamic Gaussians of the object that ``scene`` shows (paper, section "Dynamic Gaussian reconstruction").
 
-    All frames and cameras of ``scene`` are fitted: use ``scene.restricted`` to hold some out. Raises InputError if a
-    frame shows no object, MasivError if the fit fails.
+    All frames and cameras of ``scene`` are fitted: use ``scene.restricted`` to hold some out. Cameras are refined with
+    them (``config.reconstruct.refine_calibration``): use ``calibrated`` for the scene as later steps should see it.
+    Raises InputError if a frame shows no object, MasivError if the fit fails.
     """
     from masiv.splat.reconstruct import reconstruct as stage
 
@@ -70,14 +73,22 @@ def reconstruct(scene: Scene, config: Config | None = None, *, progress: Progres
     return stage(scene, config.reconstruct, seed=config.seed, checkpoint=Checkpoint(None), progress=progress)
 
 
+def calibrated(scene: Scene, gaussians: DynamicGaussians) -> Scene:
+    """``scene`` with the cameras that were refined with ``gaussians``; as it is if none were, or if it has them."""
+    return scene if gaussians.calibration is None else gaussians.calibration.applied_to(scene)
+
+
 def estimate_trajectory(
     scene: Scene, gaussians: DynamicGaussians, config: Config | None = None, *, progress: Progress = silent
 ) -> Trajectory:
-    """Fill the object with particles and follow them: ``positions`` (T, Q, 3) [m] at ``times`` (T,) [s]."""
+    """Fill the object with particles and follow them: ``positions`` (T, Q, 3) [m] at ``times`` (T,) [s].
+
+    The cameras of ``scene`` are those that were refined with ``gaussians``, if any were.
+    """
     from masiv.continuum.trajectory import estimate_trajectory as stage
 
     config = _started(config)
-    return stage(scene, gaussians, config.trajectory, seed=config.seed, progress=progress)
+    return stage(calibrated(scene, gaussians), gaussians, config.trajectory, seed=config.seed, progress=progress)
 
 
 def identify(

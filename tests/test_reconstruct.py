@@ -15,7 +15,7 @@ from masiv.progress import silent
 from masiv.scene.scene import Frame, Scene
 from masiv.splat._reference import _render
 from masiv.splat.config import ReconstructConfig
-from masiv.splat.data_parallel import GradientWorker
+from masiv.splat.data_parallel import GradientWorker, Networks
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.losses import neighbour_pairs, ssim, strain
@@ -159,9 +159,15 @@ def test_resumed_run_ends_with_the_same_numbers(scene, result, tmp_path):
         assert torch.equal(getattr(again.canonical, name), getattr(result.canonical, name)), name
     for name, value in result.deformation.state_dict().items():
         assert torch.equal(value, again.deformation.state_dict()[name]), name
+    assert same(again, result)
 
 
 def same(one, other):
+    for a, b in zip(one.calibration.refined, other.calibration.refined, strict=True):
+        if not (np.array_equal(a.world_to_camera, b.world_to_camera) and np.array_equal(a.intrinsics, b.intrinsics)):
+            return False
+    if one.calibration.time_offsets != other.calibration.time_offsets:
+        return False
     gaussians = ("means", "scales", "opacities", "colours")
     return all(torch.equal(getattr(one.canonical, n), getattr(other.canonical, n)) for n in gaussians) and all(
         torch.equal(value, other.deformation.state_dict()[n]) for n, value in one.deformation.state_dict().items()
@@ -226,9 +232,9 @@ def test_what_the_second_process_cannot_draw_is_told_of(scene):
     pairs = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long)
     part = Part(((0, 0, np.zeros(3)),), 1, (0,), 1, None, scale_term=True)
     with GradientWorker() as worker:
-        worker.configure(objective, network, 4)
+        worker.configure(objective, Networks(network), 4)
         for _ in range(2):  # it goes on
-            worker.submit(gaussians, network, pairs, part)
+            worker.submit(gaussians, Networks(network), pairs, part, corrected=False)
             with pytest.raises(MasivError, match="not finite"):
                 worker.result()
         process = worker._process
@@ -269,7 +275,11 @@ def test_a_frame_without_the_object_is_named(scene):
 
 def test_result_round_trip(result, tmp_path):
     result.save(tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["deformation.safetensors", "gaussians.ply"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "calibration.json",
+        "deformation.safetensors",
+        "gaussians.ply",
+    ]
     again = DynamicGaussians.load(tmp_path)
     torch.testing.assert_close(again.at(0.1).means, result.at(0.1).means, atol=1e-6, rtol=0)
     torch.testing.assert_close(again.at(0.1).scales, result.at(0.1).scales, rtol=1e-4, atol=0)

@@ -37,13 +37,14 @@ class SceneRequest:
 
     fit_frames: only the first so many frames are fitted. holdout_camera: indices of cameras that no fit sees.
     identify: keys of that section of the configuration (``law``, ``geometry_loss`` …). no_silhouette: a neural
-    law is fitted to geometry alone.
+    law is fitted to geometry alone. keep_calibration: cameras stay as given.
     """
 
     fit_frames: int | None = None
     holdout_camera: tuple[int, ...] = ()
     identify: Mapping[str, Any] = field(default_factory=dict)
     no_silhouette: bool = False
+    keep_calibration: bool = False
 
 
 @dataclass(frozen=True)

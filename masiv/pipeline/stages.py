@@ -16,6 +16,7 @@ from masiv.progress import Progress, silent
 from masiv.report.history import logged
 from masiv.report.sections.material import MATERIAL
 from masiv.runfolder import RunFolder
+from masiv.scene.calibration import Calibration
 from masiv.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -24,9 +25,16 @@ if TYPE_CHECKING:
     from masiv.twin import Twin
 
 
+def calibrated_scene(run: RunFolder, scene: Scene) -> Scene:
+    """``scene`` with the cameras that the run's reconstruct stage refined; as it is where none were."""
+    calibration = Calibration.load(run.path) if run.done("reconstruct") else None
+    return scene if calibration is None else calibration.applied_to(scene)
+
+
 def training_scene(run: RunFolder, scene: Scene) -> Scene:
-    """``scene`` without held-out frames and cameras: what a stage that fits may see."""
-    return scene.restricted(run.fit_frames, run.holdout_cameras)
+    """``scene`` without held-out frames and cameras: what a stage that fits may see. Its cameras are the refined ones
+    once there are any."""
+    return calibrated_scene(run, scene).restricted(run.fit_frames, run.holdout_cameras)
 
 
 def load_gaussians(run: RunFolder) -> DynamicGaussians:
@@ -135,7 +143,7 @@ def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, pro
         return Trajectory.load(path)
     runtime.start(config.arch)
     given = load_trajectory(run)
-    visible = scene.restricted(holdout_cameras=run.holdout_cameras)
+    visible = calibrated_scene(run, scene).restricted(holdout_cameras=run.holdout_cameras)
     folder.mkdir(exist_ok=True)
     checkpoint = run.checkpoint("held_out_gaussians")
     if not (folder / "deformation.safetensors").is_file():

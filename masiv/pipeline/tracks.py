@@ -30,6 +30,11 @@ NOT_FOR_TRACKS = (
     *("force", "force_from", "force_until", "render", "view"),
 )
 """Fields of ``SimulateRequest`` that apply to a filmed body alone."""
+NOT_REQUESTED_OF_TRACKS = (
+    *("fit_frames", "holdout_camera", "geometry_loss", "no_silhouette", "also"),
+    "keep_calibration",
+)
+"""Fields of ``SceneRequest`` that apply to pictures alone."""
 
 
 class TracksRun(Run):
@@ -44,7 +49,7 @@ class TracksRun(Run):
     @classmethod
     def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> TracksRun:
         """As ``Run.open``. The law is ``auto`` if none is named, since markers cannot teach a neural one."""
-        refuse(request, ("fit_frames", "holdout_camera", "geometry_loss", "no_silhouette", "also"), "pictures", scene)
+        refuse(request, NOT_REQUESTED_OF_TRACKS, "pictures", scene)
         existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
         file = overrides.config
         named = file is not None and "law" in (read_yaml(file).get("identify") or {})

@@ -20,18 +20,24 @@ from masiv.scene.scene import Scene
 
 
 class VideoRun(Run):
-    """See ``masiv.pipeline.run.Run``. scene: all frames and cameras; stages that fit see ``training_scene`` of it."""
+    """See ``masiv.pipeline.run.Run``. Stages that fit see ``training_scene`` of ``scene``."""
 
     layouts = "pictures"
 
     def __init__(self, folder: RunFolder, config: Config, scene: Scene) -> None:
         super().__init__(folder, config)
-        self.scene = scene
+        self._given = scene
+
+    @property
+    def scene(self) -> Scene:
+        """All frames and cameras; after the reconstruct stage, the cameras that it refined."""
+        return stages.calibrated_scene(self.folder, self._given)
 
     @classmethod
     def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> VideoRun:
         existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
-        flags = {f"identify.{key}": value for key, value in request.identify.items()}
+        flags: dict[str, Any] = {f"identify.{key}": value for key, value in request.identify.items()}
+        flags["reconstruct.refine_calibration"] = False if request.keep_calibration else None
         config = settings(overrides, existing.config if existing else None, **flags)
         read = read_scene(scene)
         for other in config.identify.also:
@@ -82,8 +88,9 @@ class VideoRun(Run):
         from masiv.report.video import write_report
         from masiv.simulation.simulate import simulate
 
-        folder, scene = self.folder, self.scene
-        dynamic = stages.ensure_gaussians(folder, self.config, scene, progress)
+        folder = self.folder
+        dynamic = stages.ensure_gaussians(folder, self.config, self.scene, progress)
+        scene = self.scene
         trajectory = stages.ensure_trajectory(folder, self.config, scene, progress)
         twin = stages.ensure_twin(folder, self.config, scene, progress)
         with stages.material_description(folder, self.config, twin):

@@ -37,6 +37,7 @@ class Scene:
     hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
     depth_noise: None if the pictures have no depth. ``load_cloud(frame)``: for a recording of point clouds, which has
     no cameras; ``cloud(frame)`` also checks that this scene contains it.
+    time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
     """
 
     path: Path
@@ -56,6 +57,7 @@ class Scene:
     fit_frames: int | None = None
     depth_noise: DepthNoise | None = None
     load_cloud: Callable[[int], Cloud] | None = None
+    time_offsets: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.load, FrameCache):

@@ -18,6 +18,7 @@ from masiv.scene.cloud import Cloud
 from masiv.scene.scene import Scene
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
+from masiv.splat.image_formation import ImageFormation
 from masiv.splat.initialize import InitialGaussians
 from masiv.splat.losses import Pairs
 from masiv.splat.objective import Objective, Part
@@ -38,8 +39,9 @@ _FLATNESS = 0.1
 
 
 def for_clouds(config: ReconstructConfig) -> ReconstructConfig:
-    """``config`` without what needs pictures: hulls, and steps on frame 0 alone, where there is no motion."""
-    return config.model_copy(update={"hull_weight": 0.0, "first_frame_fraction": 0.0})
+    """``config`` without what needs pictures: hulls, corrections of cameras, and steps on frame 0 alone, where there is
+    no motion."""
+    return config.model_copy(update={"hull_weight": 0.0, "first_frame_fraction": 0.0, "refine_calibration": False})
 
 
 @dataclass(frozen=True)
@@ -98,19 +100,24 @@ class CloudObjective(Objective):
         return tuple(replace(part, hull=(nothing, nothing, hull_factor)) for part in parts)
 
     def part(
-        self, gaussians: dict[str, torch.Tensor], network: DeformationNetwork, pairs: Pairs, part: Part
+        self,
+        gaussians: dict[str, torch.Tensor],
+        network: DeformationNetwork,
+        pairs: Pairs,
+        part: Part,
+        formation: ImageFormation | None = None,
     ) -> torch.Tensor:
-        """See ``Objective.part``."""
+        """See ``Objective.part``. There is no camera to correct."""
         means = gaussians["means"].detach()
-        frames = sorted({frame for frame, *_ in part.images})
-        if frames[-1] == 0:
+        moments = self._moments(part, None)
+        if not moments.moving:
             return 0.0 * network.base_motion.sum()
-        displacements, _ = network.changes(means, torch.tensor(frames) / self.fps)
+        displacements, _ = network.changes(means, moments.times)
         stiffness = 1.0 if part.hull is None else 1.0 + (STIFFER - 1.0) * part.hull[2]
-        loss = stiffness * self._regularization(means, displacements, frames, pairs, replace(part, hull=None))
-        for frame, *_ in part.images:
+        loss = stiffness * self._regularization(means, displacements, moments, pairs, replace(part, hull=None))
+        for (frame, *_), k in zip(part.images, moments.of_image, strict=True):
             if frame > 0:
-                distance = self.clouds[frame](means + displacements[frames.index(frame)])
+                distance = self.clouds[frame](means + displacements[k])
                 loss = loss + self.config.cloud_weight * distance / (self.half_extent * part.image_count)
         return loss
 

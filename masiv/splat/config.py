@@ -5,6 +5,27 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict, Field
 
 
+class CalibrationConfig(BaseModel):
+    """Prior standard deviations of the corrections, and the optimiser's steps."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rotation_deg: float = Field(0.5, gt=0, description="prior standard deviation of a camera's rotation [degrees]")
+    translation_fraction: float = Field(
+        0.005, gt=0, description="of a camera's place, as a fraction of its distance to the object"
+    )
+    focal_fraction: float = Field(0.005, gt=0, description="of a camera's focal length, as a fraction")
+    time_frames: float = Field(0.5, gt=0, description="of a camera's clock [frames]")
+    log_gain: float = Field(0.05, gt=0, description="of the logarithm of an image's gain, for each colour channel")
+    offset: float = Field(0.01, gt=0, description="of an image's offset, as a fraction of white")
+    rate_px: float = Field(0.01, gt=0, description="initial learning rate of cameras [pixels]")
+    exposure_rate: float = Field(0.02, gt=0, description="initial learning rate of exposures, in steps of 2 % of white")
+    start_fraction: float = Field(
+        0.06, ge=0, lt=1, description="fraction of the steps after which cameras are refined; before, the first frame "
+        "settles",
+    )  # fmt: skip
+
+
 class ReconstructConfig(BaseModel):
     """Dynamic Gaussians from video. Learning rates of positions are fractions of the object's half-extent."""
 
@@ -21,6 +42,11 @@ class ReconstructConfig(BaseModel):
         128, ge=16, description="images are averaged down until the object's box is at most this wide [pixels]"
     )
     crop_padding: int = Field(8, ge=1, description="pixels around the object's box")
+
+    refine_calibration: bool = Field(
+        True, description="whether cameras and exposures are refined with the Gaussians; false: the calibration is kept"
+    )
+    calibration: CalibrationConfig = CalibrationConfig.model_validate({})
 
     bases: int = Field(10, ge=1, description="motion bases B")
     width: int = Field(96, ge=4, description="hidden width of the motion networks")

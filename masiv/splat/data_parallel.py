@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -24,6 +25,7 @@ import torch
 from masiv import runtime
 from masiv.errors import MasivError
 from masiv.splat.deformation import DeformationNetwork
+from masiv.splat.image_formation import ImageFormation
 from masiv.splat.losses import Pairs
 from masiv.splat.objective import PARAMETER_NAMES, Objective, Part
 from masiv.workers import ONE_THREAD, run_task, unwrap
@@ -37,17 +39,39 @@ _COMMAND = (
 """Imports from where this process does, as ``multiprocessing`` has it; PYTHONPATH stays as it is."""
 
 
-def parameters(gaussians: dict[str, torch.Tensor], network: DeformationNetwork) -> list[torch.Tensor]:
+@dataclass(frozen=True)
+class Networks:
+    """What moves the Gaussians, and what corrects cameras and exposures (None: they are as given)."""
+
+    deformation: DeformationNetwork
+    formation: ImageFormation | None = None
+
+    def parameters(self) -> list[torch.nn.Parameter]:
+        """Those of both."""
+        return [*self.deformation.parameters(), *(self.formation.parameters() if self.formation is not None else ())]
+
+
+def parameters(gaussians: dict[str, torch.Tensor], networks: Networks) -> list[torch.Tensor]:
     """All parameters, in the order of their gradients."""
-    return [*(gaussians[name] for name in PARAMETER_NAMES), *network.parameters()]
+    return [*(gaussians[name] for name in PARAMETER_NAMES), *networks.parameters()]
 
 
 def gradients(
-    objective: Objective, gaussians: dict[str, torch.Tensor], network: DeformationNetwork, pairs: Pairs, part: Part
+    objective: Objective,
+    gaussians: dict[str, torch.Tensor],
+    networks: Networks,
+    pairs: Pairs,
+    part: Part,
+    *,
+    corrected: bool,
 ) -> tuple[float, Gradients]:
-    """The loss of ``part`` and its gradient for each of ``parameters``, None for one that it does not depend on."""
-    loss = objective.part(gaussians, network, pairs, part)
-    return float(loss.detach()), torch.autograd.grad(loss, parameters(gaussians, network), allow_unused=True)
+    """The loss of ``part`` and its gradient for each of ``parameters``, None for one that it does not depend on.
+
+    corrected: whether cameras and exposures are corrected yet.
+    """
+    formation = networks.formation if corrected else None
+    loss = objective.part(gaussians, networks.deformation, pairs, part, formation)
+    return float(loss.detach()), torch.autograd.grad(loss, parameters(gaussians, networks), allow_unused=True)
 
 
 class GradientWorker:
@@ -84,19 +108,21 @@ class GradientWorker:
         self._process.stdout.close()
         self._file.close()
 
-    def configure(self, objective: Objective, network: DeformationNetwork, count: int) -> None:
+    def configure(self, objective: Objective, networks: Networks, count: int) -> None:
         """Send what is the same for all steps. count: Gaussians, at most. Raises MasivError if the process died."""
-        size = 8 * count + sum(p.numel() for p in network.parameters())
+        size = 8 * count + sum(p.numel() for p in networks.parameters())
         self._file.truncate(2 * 4 * size)
         self._values, self._gradients = _mapped(self._file.fileno(), size)
-        self._send((objective, network, size))
+        self._send((objective, networks, size))
 
-    def submit(self, gaussians: dict[str, torch.Tensor], network: DeformationNetwork, pairs: Pairs, part: Part) -> None:
+    def submit(
+        self, gaussians: dict[str, torch.Tensor], networks: Networks, pairs: Pairs, part: Part, *, corrected: bool
+    ) -> None:
         """Start computing ``part``; ``result`` waits for it. Raises MasivError if the process died."""
-        self._parameters = parameters(gaussians, network)
+        self._parameters = parameters(gaussians, networks)
         flat = torch.cat([parameter.detach().flatten() for parameter in self._parameters])
         self._values[: len(flat)] = flat
-        self._send((part, len(gaussians["means"]), None if pairs is self._pairs else pairs))
+        self._send((part, len(gaussians["means"]), None if pairs is self._pairs else pairs, corrected))
         self._pairs = pairs
 
     def result(self) -> tuple[float, Gradients]:
@@ -136,22 +162,22 @@ def _views(flat: torch.Tensor, shapes: Sequence[torch.Size]) -> list[torch.Tenso
 class _Server:
     """The state of the second process."""
 
-    def __init__(self, file: int, objective: Objective, network: DeformationNetwork, size: int) -> None:
-        self.objective, self.network = objective, network
+    def __init__(self, file: int, objective: Objective, networks: Networks, size: int) -> None:
+        self.objective, self.networks = objective, networks
         self.values, self.gradients = _mapped(file, size)
         self.pairs: Pairs = ()
 
-    def compute(self, part: Part, count: int, pairs: Pairs | None) -> tuple[float, list[bool]]:
+    def compute(self, part: Part, count: int, pairs: Pairs | None, corrected: bool) -> tuple[float, list[bool]]:
         """The loss, and which parameters it depends on. Their gradients are written to the common memory."""
         self.pairs = pairs or self.pairs
         shapes = [torch.Size(s) for s in ((count, 3), (count,), (count,), (count, 3))]
-        shapes += [p.shape for p in self.network.parameters()]
+        shapes += [p.shape for p in self.networks.parameters()]
         given = _views(self.values, shapes)
         gaussians = {name: v.clone().requires_grad_() for name, v in zip(PARAMETER_NAMES, given, strict=False)}
         with torch.no_grad():
-            for parameter, value in zip(self.network.parameters(), given[len(PARAMETER_NAMES) :], strict=True):
+            for parameter, value in zip(self.networks.parameters(), given[len(PARAMETER_NAMES) :], strict=True):
                 parameter.copy_(value)
-        loss, found = gradients(self.objective, gaussians, self.network, self.pairs, part)
+        loss, found = gradients(self.objective, gaussians, self.networks, self.pairs, part, corrected=corrected)
         for gradient, target in zip(found, _views(self.gradients, shapes), strict=True):
             if gradient is not None:
                 target.copy_(gradient)

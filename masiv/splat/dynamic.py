@@ -7,16 +7,21 @@ from pathlib import Path
 
 import torch
 
+from masiv.scene.calibration import Calibration
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
 class DynamicGaussians:
-    """canonical: the Gaussians at frame 0; deformation: their displacement and change of size at a time."""
+    """canonical: the Gaussians at frame 0; deformation: their displacement and change of size at a time.
+
+    calibration: the cameras as they were refined with them; None if they were kept as given.
+    """
 
     canonical: Gaussians
     deformation: DeformationNetwork
+    calibration: Calibration | None = None
 
     def at(self, time: float) -> Gaussians:
         """The Gaussians at ``time`` [s], 0 at the first frame; without gradients."""
@@ -27,14 +32,18 @@ class DynamicGaussians:
         return Gaussians(canonical.means + displacement, scales, canonical.opacities, canonical.colours)
 
     def save(self, folder: Path) -> None:
-        """Write gaussians.ply and deformation.safetensors into ``folder``."""
+        """Write gaussians.ply, deformation.safetensors and, if cameras were refined, calibration.json to ``folder``."""
         self.canonical.save_ply(Path(folder) / "gaussians.ply")
         self.deformation.save(Path(folder) / "deformation.safetensors")
+        if self.calibration is not None:
+            self.calibration.save(folder)
 
     @classmethod
     def load(cls, folder: Path) -> DynamicGaussians:
         """Read what ``save`` wrote. Raises InputError if a file is missing or broken."""
         folder = Path(folder)
         return cls(
-            Gaussians.load_ply(folder / "gaussians.ply"), DeformationNetwork.load(folder / "deformation.safetensors")
+            Gaussians.load_ply(folder / "gaussians.ply"),
+            DeformationNetwork.load(folder / "deformation.safetensors"),
+            Calibration.load(folder),
         )

@@ -12,6 +12,7 @@ from masiv.scene.scene import Ground
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.hull_loss import HullLoss
+from masiv.splat.image_formation import Corrections, ImageFormation
 from masiv.splat.losses import Pairs, depth_distance, ssim, strain
 from masiv.splat.observed_image import ObservedImage
 from masiv.splat.rasteriser import render
@@ -29,7 +30,8 @@ class Part:
     images: (frame, index of its image, background (3,)), frames ascending; image_count: images of the whole step.
     regularized: frames whose strain and ground terms this part contains; frame_count: frames of the whole step.
     hull: Gaussians and surface points that are compared with the hull of the last frame, and the weight of the term.
-    scale_term: whether this part contains the term of the mean scale.
+    scale_term: whether this part contains the terms that belong to no image: mean scale, prior of the cameras.
+    moving: whether the step has a frame after the first. A clock that is off shows there only.
     """
 
     images: tuple[tuple[int, int, np.ndarray], ...]
@@ -38,6 +40,20 @@ class Part:
     frame_count: int
     hull: tuple[np.ndarray, np.ndarray, float] | None
     scale_term: bool
+    moving: bool = True
+
+
+@dataclass(frozen=True)
+class Moments:
+    """When the motion is evaluated: times (K,) [s]; which of them is that of each image, and of each frame's terms.
+
+    moving: whether anything can have moved by then.
+    """
+
+    times: torch.Tensor
+    of_image: list[int]
+    of_frame: dict[int, int]
+    moving: bool
 
 
 @dataclass(frozen=True)
@@ -63,10 +79,11 @@ class Objective:
         chosen: list[tuple[int, int]],
         hull_factor: float,
         rng: np.random.Generator,
+        formation: ImageFormation | None = None,
     ) -> torch.Tensor:
         """The loss of one step, a scalar: the sum over ``parts``."""
         parts = self.parts(len(gaussians["means"]), chosen, hull_factor, rng)
-        return torch.stack([self.part(gaussians, network, pairs, part) for part in parts]).sum()
+        return torch.stack([self.part(gaussians, network, pairs, part, formation) for part in parts]).sum()
 
     def parts(
         self, count: int, chosen: list[tuple[int, int]], hull_factor: float, rng: np.random.Generator
@@ -77,6 +94,7 @@ class Objective:
         image); hull_factor in [0, 1] multiplies the weight of the hull; rng draws backgrounds and hull samples.
         """
         last = max(frame for frame, _ in chosen)
+        moving = last > 0
         weight = self.config.hull_weight * hull_factor
         hull = (*self.hulls[last].draw(count, HULL_SAMPLES, rng), weight) if last > 0 and weight > 0 else None
         drawn = sorted(((*image, rng.random(3)) for image in chosen), key=lambda image: image[0])
@@ -92,6 +110,7 @@ class Objective:
                 len(frames),
                 hull if last else None,
                 scale_term=last,
+                moving=moving,
             )
 
         if cut == len(drawn):
@@ -104,38 +123,66 @@ class Objective:
         network: DeformationNetwork,
         pairs: Pairs,
         part: Part,
+        formation: ImageFormation | None = None,
     ) -> torch.Tensor:
         """The loss of ``part``, a scalar.
 
         gaussians: means (N, 3) [m], log_scales, opacity_logits (N,), colour_logits (N, 3). pairs: neighbours.
+        formation: corrections of cameras and exposures, and then their prior; None: all are as given.
         """
         c, means = self.config, gaussians["means"]
         opacities, colours = torch.sigmoid(gaussians["opacity_logits"]), torch.sigmoid(gaussians["colour_logits"])
         loss = means.new_zeros(())
         if part.scale_term:
             loss = loss + c.scale_weight * gaussians["log_scales"].exp().mean() / self.scale
-        frames = sorted({frame for frame, *_ in part.images})
-        displacements, log_changes = torch.zeros(len(frames), len(means), 3), torch.zeros(len(frames), len(means))
-        if frames[-1] > 0:
+        corrected = None if formation is None else formation()
+        moments = self._moments(part, corrected)
+        displacements = torch.zeros(len(moments.times), len(means), 3)
+        log_changes = torch.zeros(len(moments.times), len(means))
+        if moments.moving:
             # As in MASIV, the network gets positions without a gradient: errors of the motion change the motion only.
-            displacements, log_changes = network.changes(means.detach(), torch.tensor(frames) / self.fps)
-            loss = loss + self._regularization(means.detach(), displacements, frames, pairs, part)
-        for frame, index, drawn_background in part.images:
-            k, observed = frames.index(frame), self.images[frame][index]
+            displacements, log_changes = network.changes(means.detach(), moments.times)
+            loss = loss + self._regularization(means.detach(), displacements, moments, pairs, part)
+        image_losses = []
+        for (frame, index, drawn_background), k in zip(part.images, moments.of_image, strict=True):
+            observed = self.images[frame][index]
             background = torch.tensor(drawn_background, dtype=torch.float32)
             scales = (gaussians["log_scales"] + log_changes[k]).exp()
-            drawn = render(observed.camera, means + displacements[k], scales, opacities, colours, background)
-            loss = loss + self._image_loss(drawn.rgb, drawn.alpha, observed, background) / part.image_count
+            positions = means + displacements[k]
+            if corrected is not None:
+                positions = corrected.positions(observed.view, positions)
+            drawn = render(observed.camera, positions, scales, opacities, colours, background)
+            rgb = drawn.rgb
+            if corrected is not None:
+                rgb = corrected.rgb(observed.view, frame, rgb, drawn.alpha, background)
+            image_losses.append(self._image_loss(rgb, drawn.alpha, observed, background))
+            loss = loss + image_losses[-1] / part.image_count
             if observed.depth is not None and c.depth_weight > 0:
-                distance = depth_distance(drawn.depth, drawn.alpha, observed.depth)
+                depth = drawn.depth if corrected is None else corrected.depth(observed.view, drawn.depth)
+                distance = depth_distance(depth, drawn.alpha, observed.depth)
                 loss = loss + c.depth_weight * distance / (self.half_extent * part.image_count)
+        if part.scale_term and formation is not None and corrected is not None:
+            level = torch.stack(image_losses).detach().mean()
+            loss = loss + level * formation.prior_weight * corrected.penalty()
         return loss
+
+    def _moments(self, part: Part, corrected: Corrections | None) -> Moments:
+        """One moment a frame, or one an image if each camera has its own clock."""
+        in_images = [frame for frame, *_ in part.images]
+        frames = sorted(set(in_images))
+        if corrected is None:
+            of_image = [frames.index(frame) for frame in in_images]
+            of_frame = {frame: row for row, frame in enumerate(frames)}
+            return Moments(torch.tensor(frames) / self.fps, of_image, of_frame, moving=frames[-1] > 0)
+        views = [self.images[frame][index].view for frame, index, _ in part.images]
+        of_frame = {frame: in_images.index(frame) for frame in frames}
+        return Moments(corrected.times(views, in_images), list(range(len(in_images))), of_frame, part.moving)
 
     def _regularization(
         self,
         means: torch.Tensor,
         displacements: torch.Tensor,
-        frames: list[int],
+        moments: Moments,
         pairs: Pairs,
         part: Part,
     ) -> torch.Tensor:
@@ -144,9 +191,8 @@ class Objective:
         total = means.new_zeros(())
         if part.regularized:
             fraction = len(part.regularized) / part.frame_count
-            here = displacements if len(part.regularized) == len(frames) else displacements[
-                [frames.index(frame) for frame in part.regularized]
-            ]  # fmt: skip
+            rows = [moments.of_frame[frame] for frame in part.regularized]
+            here = displacements if rows == list(range(len(displacements))) else displacements[rows]
             total = total + fraction * c.rigidity_weight * strain(means, here, *pairs, softening=self.scale)
             if self.ground is not None:
                 normal = torch.tensor(self.ground.normal, dtype=torch.float32)
@@ -154,7 +200,8 @@ class Objective:
                 total = total + fraction * c.ground_weight * below.mean() / self.half_extent
         if part.hull is not None:
             chosen, surface, weight = part.hull
-            distance = self.hulls[frames[-1]](means + displacements[-1], chosen, surface)
+            last = max(moments.of_frame)
+            distance = self.hulls[last](means + displacements[moments.of_frame[last]], chosen, surface)
             total = total + weight * distance / self.half_extent
         return total
 

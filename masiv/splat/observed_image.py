@@ -32,10 +32,12 @@ class ObservedDepth:
 class ObservedImage:
     """One image of the object; float32 tensors.
 
-    camera: of the crop. colour (H, W, 3) in [0, 1], multiplied by the mask. mask (H, W) in [0, 1]. valid (H, W): the
-    fraction of a pixel that no occluder hides. depth: measured depth of the object, if the recording has any.
+    view: index of the camera among those that are fitted. camera: of the crop. colour (H, W, 3) in [0, 1], multiplied
+    by the mask. mask (H, W) in [0, 1]. valid (H, W): the fraction of a pixel that no occluder hides. depth:
+    measured depth of the object, if the recording has any.
     """
 
+    view: int
     camera: Camera
     colour: torch.Tensor
     mask: torch.Tensor
@@ -79,6 +81,7 @@ def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_
     visible = _average(valid, factor)
     divisor = np.maximum(visible, 1e-6)
     return ObservedImage(
+        scene.views.index(view),
         _reduced_camera(camera.cropped(x0, y0, width * factor, height * factor), factor),
         torch.from_numpy(_average(colour, factor) / divisor[..., None]),
         torch.from_numpy(_average(mask, factor) / divisor),

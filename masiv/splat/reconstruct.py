@@ -13,20 +13,25 @@ from masiv import runtime
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.progress import Progress
+from masiv.scene.calibration import Calibration
 from masiv.scene.scene import Scene
 from masiv.splat.clouds import cloud_objective, for_clouds, initial_from_clouds
 from masiv.splat.config import ReconstructConfig
-from masiv.splat.data_parallel import GradientWorker, gradients, parameters
+from masiv.splat.data_parallel import GradientWorker, Networks, gradients, parameters
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.extrapolate import extrapolate_motion
 from masiv.splat.gaussians import Gaussians
 from masiv.splat.hull_loss import HullLoss
+from masiv.splat.image_formation import ImageFormation
 from masiv.splat.initialize import InitialGaussians, initial_gaussians
 from masiv.splat.losses import neighbour_pairs
 from masiv.splat.objective import PARAMETER_NAMES, Objective, Part
 from masiv.splat.observed_image import observed_images
 from masiv.workers import process_count
+
+HULL_POINTS = 300
+"""Points of a frame's hull that say how far a correction of a camera moves the object in its picture."""
 
 
 def reconstruct(
@@ -50,7 +55,7 @@ def reconstruct(
             checkpoint.maybe_save(fit.state)
             if fit.iteration % 10 == 0 or fit.iteration == config.iterations:
                 progress("reconstruct", fit.iteration, config.iterations, f"loss {loss:.4f}, {fit.frames} frames")
-    return DynamicGaussians(fit.canonical(), fit.network.eval().requires_grad_(False))
+    return DynamicGaussians(fit.canonical(), fit.network.eval().requires_grad_(False), fit.calibration())
 
 
 class _Fit:
@@ -72,12 +77,13 @@ class _Fit:
         )
         initial = self._observe(progress)
         self.half_extent = initial.half_extent
+        self.formation = self._image_formation(initial) if self.config.refine_calibration else None
         if state is not None and state["identity"] == self.identity:
             self._resume(state)
         else:
             self._begin(initial)
         if worker is not None:
-            worker.configure(self.objective, self.network, len(self.parameters["means"]))
+            worker.configure(self.objective, self.networks, len(self.parameters["means"]))
 
     def _observe(self, progress: Progress) -> InitialGaussians:
         """Set the objective, ``images`` by frame and their number; returns the start of the fit."""
@@ -119,6 +125,8 @@ class _Fit:
         self.parameters = state["parameters"]
         self.network = self._network(state["network"]["centre"], state["network"]["base_motion"])
         self.network.load_state_dict(state["network"])
+        if self.formation is not None:
+            self.formation.load_state_dict(state["formation"])
         self._start_optimiser()
         self.optimiser.load_state_dict(state["optimiser"])
         self.pairs = tuple(state["pairs"])
@@ -130,6 +138,7 @@ class _Fit:
             "iteration": self.iteration,
             "parameters": {name: value.detach() for name, value in self.parameters.items()},
             "network": self.network.state_dict(),
+            "formation": {} if self.formation is None else self.formation.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "pairs": list(self.pairs),
         }
@@ -149,6 +158,28 @@ class _Fit:
             time_octaves=c.time_octaves,
         )
 
+    def _image_formation(self, initial: InitialGaussians) -> ImageFormation:
+        """Cameras and exposures that are not corrected yet. Steps are scaled by what the hulls show of the object."""
+        scene = self.scene
+        velocities = np.gradient(initial.base_motion, 1 / scene.fps, axis=0)
+        surfaces = [hull.points[hull.surface] for hull in initial.hulls]
+        surfaces = [points[:: max(1, len(points) // HULL_POINTS)] for points in surfaces]
+        shown = [float(image.mask.sum()) for of_frame in self.images for image in of_frame]
+        return ImageFormation(
+            [scene.cameras[view] for view in scene.views],
+            scene.frame_count,
+            scene.fps,
+            self.config.calibration,
+            np.concatenate(surfaces),
+            np.repeat(velocities, [len(points) for points in surfaces], axis=0),
+            float(np.mean(shown)),
+        )
+
+    @property
+    def networks(self) -> Networks:
+        """What moves the Gaussians and corrects the images."""
+        return Networks(self.network, self.formation)
+
     def _start_optimiser(self) -> None:
         c, extent = self.config, self.half_extent
         rates = dict(
@@ -159,6 +190,10 @@ class _Fit:
         groups = [{"name": name, "params": [self.parameters[name]], "rate": rates[name]} for name in PARAMETER_NAMES]
         groups += [{"name": "weights", "params": weights, "rate": c.motion_rate}]
         groups += [{"name": "base_motion", "params": [self.network.base_motion], "rate": c.base_rate * extent}]
+        if self.formation is not None:
+            calibration, formation = c.calibration, self.formation
+            groups += [{"name": "cameras", "params": [formation.pose], "rate": calibration.rate_px}]
+            groups += [{"name": "exposures", "params": [formation.exposure], "rate": calibration.exposure_rate}]
         self.optimiser = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
         self._find_neighbours()
 
@@ -181,12 +216,23 @@ class _Fit:
         grown = self.config.first_frame_fraction + self.config.growth_fraction
         return max(0.0, (self.iteration / self.config.iterations - grown) / (1 - grown))
 
+    @property
+    def corrected(self) -> bool:
+        """Whether cameras and exposures are refined at this iteration. At first the first frame settles alone."""
+        c = self.config
+        return c.refine_calibration and self.iteration >= c.calibration.start_fraction * c.iterations
+
     def canonical(self) -> Gaussians:
         """The Gaussians at frame 0, without gradients."""
         p = {name: value.detach() for name, value in self.parameters.items()}
         return Gaussians(
             p["means"], p["log_scales"].exp(), torch.sigmoid(p["opacity_logits"]), torch.sigmoid(p["colour_logits"])
         )
+
+    def calibration(self) -> Calibration | None:
+        """The cameras as they are corrected now; None if they are kept."""
+        f = self.formation
+        return None if f is None else Calibration.of(self.scene, f.found(), f.pivot, f.points)
 
     def step(self) -> float:
         """One step of Adam on a batch of images; returns the loss."""
@@ -220,14 +266,14 @@ class _Fit:
 
     def _compute_gradients(self, parts: tuple[Part, ...]) -> float:
         """Set the gradient of each parameter to the sum over ``parts``, in their order; returns the loss."""
-        given = (self.objective, self.parameters, self.network, self.pairs)
+        given, corrected = (self.objective, self.parameters, self.networks, self.pairs), self.corrected
         if self.worker is None:
-            found = [gradients(*given, part) for part in parts]
+            found = [gradients(*given, part, corrected=corrected) for part in parts]
         else:
             first, other = parts
-            self.worker.submit(*given[1:], other)
-            found = [gradients(*given, first), self.worker.result()]
-        for parameter, *each in zip(parameters(self.parameters, self.network), *(g for _, g in found), strict=True):
+            self.worker.submit(*given[1:], other, corrected=corrected)
+            found = [gradients(*given, first, corrected=corrected), self.worker.result()]
+        for parameter, *each in zip(parameters(self.parameters, self.networks), *(g for _, g in found), strict=True):
             known = [gradient for gradient in each if gradient is not None]
             parameter.grad = sum(known[1:], known[0]) if known else None
         return sum(value for value, _ in found)

@@ -1,0 +1,167 @@
+"""Cameras of a scene as a fit corrected them: before, after, and what was changed; ``calibration.json`` of a run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from masiv.errors import InputError
+from masiv.files import write_json
+from masiv.scene.camera import Camera
+from masiv.scene.scene import Scene
+
+CALIBRATION = "calibration.json"
+_SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class CameraCorrection:
+    """What is added to a given camera; see ``corrected_camera``.
+
+    rotation (3,) [rad], a rotation vector, and translation (3,) [m]: in camera axes. log_focal: logarithm of the factor
+    of the focal length. time_offset [s]: the camera's frame F was taken at F / fps + time_offset.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    log_focal: float
+    time_offset: float
+
+
+NO_CORRECTION = CameraCorrection(np.zeros(3), np.zeros(3), 0.0, 0.0)
+
+
+def corrected_camera(camera: Camera, correction: CameraCorrection, pivot: np.ndarray) -> Camera:
+    """``camera`` after ``correction``: x' = R (x - c) + c + translation.
+
+    x are camera coordinates of the given camera, c those of ``pivot`` (3,) [m, world]. The focal length is multiplied
+    by exp(log_focal).
+    """
+    rotation = Rotation.from_rotvec(correction.rotation).as_matrix()
+    given = np.asarray(camera.world_to_camera, np.float64)
+    centre = given[:3, :3] @ pivot + given[:3, 3]
+    pose = np.eye(4)
+    pose[:3, :3] = rotation @ given[:3, :3]
+    pose[:3, 3] = rotation @ (given[:3, 3] - centre) + centre + correction.translation
+    intrinsics = np.array(camera.intrinsics, np.float64)
+    intrinsics[:2, :2] *= np.exp(correction.log_focal)
+    return Camera(camera.name, camera.width, camera.height, intrinsics, pose)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The cameras of a scene before and after a fit corrected them, by index of the scene.
+
+    given, refined: all cameras; those that no fit saw are the same in both. time_offsets [s] of their clocks.
+    displacement_px: root mean square by which the correction moves the object in each picture.
+    """
+
+    given: tuple[Camera, ...]
+    refined: tuple[Camera, ...]
+    time_offsets: tuple[float, ...]
+    displacement_px: tuple[float, ...]
+
+    @classmethod
+    def of(
+        cls, scene: Scene, corrections: Sequence[CameraCorrection], pivot: np.ndarray, points: np.ndarray
+    ) -> Calibration:
+        """corrections: of ``scene.views``, about ``pivot`` (3,) [m]. points (P, 3) [m]: of the object."""
+        by_view = dict(zip(scene.views, corrections, strict=True))
+        every = [by_view.get(view, NO_CORRECTION) for view in range(len(scene.cameras))]
+        refined = tuple(
+            corrected_camera(camera, by_view[view], pivot) if view in by_view else camera
+            for view, camera in enumerate(scene.cameras)
+        )
+        moved = [
+            after.project(points)[0] - before.project(points)[0]
+            for before, after in zip(scene.cameras, refined, strict=True)
+        ]
+        return cls(
+            scene.cameras,
+            refined,
+            tuple(correction.time_offset for correction in every),
+            tuple(float(np.sqrt((m**2).sum(axis=1).mean())) for m in moved),
+        )
+
+    def applied_to(self, scene: Scene) -> Scene:
+        """``scene`` with the refined cameras and their clocks; once more changes nothing.
+
+        Raises InputError if its cameras are others than those that were refined.
+        """
+        if scene.cameras is self.refined:
+            return scene
+        for known in (self.given, self.refined):
+            if len(known) == len(scene.cameras) and all(map(_same, known, scene.cameras)):
+                return replace(scene, cameras=self.refined, time_offsets=self.time_offsets)
+        raise InputError(
+            f"{scene.path}: the cameras are not those that were refined ({len(self.given)} cameras): give the scene of "
+            "the run, or reconstruct it anew"
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write calibration.json into ``folder``."""
+        rows = zip(self.given, self.refined, self.time_offsets, self.displacement_px, strict=True)
+        write_json(Path(folder) / CALIBRATION, {"schema": _SCHEMA, "cameras": [_row(*row) for row in rows]})
+
+    @classmethod
+    def load(cls, folder: Path) -> Calibration | None:
+        """What ``save`` wrote into ``folder``; None if there is none. Raises InputError if it is broken."""
+        path = Path(folder) / CALIBRATION
+        if not path.is_file():
+            return None
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            if data["schema"] != _SCHEMA:
+                raise ValueError(f"schema {data['schema']}")
+            rows = data["cameras"]
+            return cls(
+                tuple(_camera(row, "given") for row in rows),
+                tuple(_camera(row, "refined") for row in rows),
+                tuple(float(row["time_offset_s"]) for row in rows),
+                tuple(float(row["displacement_px"]) for row in rows),
+            )
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path} is not a calibration saved by masiv ({error}): reconstruct anew") from error
+
+
+def _same(one: Camera, other: Camera) -> bool:
+    return (
+        (one.name, one.width, one.height) == (other.name, other.width, other.height)
+        and np.array_equal(one.intrinsics, other.intrinsics)
+        and np.array_equal(one.world_to_camera, other.world_to_camera)
+    )
+
+
+def _row(given: Camera, refined: Camera, time_offset: float, displacement: float) -> dict[str, Any]:
+    turn = refined.world_to_camera[:3, :3] @ given.world_to_camera[:3, :3].T
+    return {
+        "name": given.name,
+        "width": given.width,
+        "height": given.height,
+        "rotation_deg": np.degrees(Rotation.from_matrix(turn).as_rotvec()),
+        "centre_shift_m": refined.centre - given.centre,
+        "focal_factor": refined.intrinsics[0, 0] / given.intrinsics[0, 0],
+        "time_offset_s": time_offset,
+        "displacement_px": displacement,
+        **{
+            name: {"intrinsics": camera.intrinsics, "world_to_camera": camera.world_to_camera}
+            for name, camera in (("given", given), ("refined", refined))
+        },
+    }
+
+
+def _camera(row: dict[str, Any], which: str) -> Camera:
+    intrinsics, pose = (np.array(row[which][key], np.float64) for key in ("intrinsics", "world_to_camera"))
+    if (
+        intrinsics.shape != (3, 3)
+        or pose.shape != (4, 4)
+        or not np.isfinite([*intrinsics.ravel(), *pose.ravel()]).all()
+    ):
+        raise ValueError(f"camera {row['name']}")
+    return Camera(str(row["name"]), int(row["width"]), int(row["height"]), intrinsics, pose)

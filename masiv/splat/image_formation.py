@@ -1,0 +1,222 @@
+"""How each camera and each image differs from what was given: pose, focal length, clock, exposure.
+
+The corrections are learnt together with the Gaussians: bundle adjustment (Triggs et al. 2000,
+doi:10.1007/3-540-44480-7_21) on the pixels themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from masiv.scene.calibration import CameraCorrection
+from masiv.scene.camera import Camera
+from masiv.splat.config import CalibrationConfig
+
+POSE = 8
+"""Corrections of a camera: rotation vector (3) [rad], translation (3) [m], log focal factor, time offset [s]."""
+REGISTRATION_NOISE_PX = 0.1
+"""Error to which pictures register a camera. It scales the optimiser's steps alone: along a direction in which one
+prior standard deviation moves the picture by less than this, steps are fractions of that standard deviation."""
+CORRELATED_PIXELS = 9
+"""Pixels whose errors are not independent: a Gaussian's footprint is about 3 x 3."""
+EXPOSURE_STEP = 0.02
+"""Unit of the exposure's parameters: a change of 2 % of white is as visible as about a pixel of displacement."""
+
+
+class ImageFormation(torch.nn.Module):
+    """Corrections of V cameras and of the exposure of their images at T frames; zero at first.
+
+    ``pose`` (V, 8) are coordinates in which a step of one moves the object by about a pixel in its picture, or by one
+    prior standard deviation. From them a linear map makes rotation about the object's centre, translation, focal length
+    and clock. The map leaves out what no picture determines: a rigid motion and scaling of all cameras, and a common
+    delay. So the mean of the corrections, with the prior's weights, has none of it. The mean gain and offset of all
+    images are zero too. All parameters are float32.
+    """
+
+    linear: torch.Tensor
+    rotations: torch.Tensor
+    translations: torch.Tensor
+    pivots: torch.Tensor
+    prior_deviations: torch.Tensor
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        frame_count: int,
+        fps: float,
+        config: CalibrationConfig,
+        points: np.ndarray,
+        velocities: np.ndarray,
+        pixels: float,
+    ) -> None:
+        """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs. pixels: mean number that an
+        image shows of the object."""
+        super().__init__()
+        self.fps, self.config, self.points = fps, config, points
+        self.pivot = points.mean(axis=0)
+        # The image loss is a mean absolute error. Of independent Laplacian errors of mean b, -log p is their sum over
+        # b: the loss times their number over b. So the prior counts b over that number.
+        self.prior_weight = CORRELATED_PIXELS / (pixels * len(cameras) * frame_count)
+        poses = np.stack([camera.world_to_camera for camera in cameras])
+        deviations = prior_deviations(cameras, self.pivot, fps, config)
+        linear = _gauge_free_steps(cameras, self.pivot, points, velocities, deviations)
+        self.register_buffer("linear", torch.tensor(linear, dtype=torch.float32), persistent=False)
+        self.register_buffer("rotations", torch.tensor(poses[:, :3, :3], dtype=torch.float32), persistent=False)
+        self.register_buffer("translations", torch.tensor(poses[:, :3, 3], dtype=torch.float32), persistent=False)
+        pivots = poses[:, :3, :3] @ self.pivot + poses[:, :3, 3]
+        self.register_buffer("pivots", torch.tensor(pivots, dtype=torch.float32), persistent=False)
+        self.register_buffer("prior_deviations", torch.tensor(deviations, dtype=torch.float32), persistent=False)
+        self.pose = torch.nn.Parameter(torch.zeros(len(cameras), POSE))
+        self.exposure = torch.nn.Parameter(torch.zeros(len(cameras), frame_count, 4))
+
+    def forward(self) -> Corrections:
+        """What the parameters say now; evaluate it once for all images of a step."""
+        return Corrections(
+            self,
+            (self.linear @ self.pose.flatten()).view_as(self.pose),
+            EXPOSURE_STEP * (self.exposure - self.exposure.mean(dim=(0, 1))),
+        )
+
+    def found(self) -> tuple[CameraCorrection, ...]:
+        """The corrections of the cameras, without gradients."""
+        rows = self().cameras.detach().double().numpy()
+        return tuple(CameraCorrection(row[:3], row[3:6], float(row[6]), float(row[7])) for row in rows)
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """cameras (V, 8): rotation vector [rad], translation [m], log focal factor, time offset [s].
+
+    exposures (V, T, 4): log gain of red, green and blue, and offset as a fraction of white.
+    """
+
+    formation: ImageFormation
+    cameras: torch.Tensor
+    exposures: torch.Tensor
+
+    def times(self, views: Sequence[int], frames: Sequence[int]) -> torch.Tensor:
+        """When images were taken, (K,) [s]: ``frames`` (K) of ``views`` (K)."""
+        return torch.tensor(frames) / self.formation.fps + self.cameras[list(views), 7]
+
+    def positions(self, view: int, positions: torch.Tensor) -> torch.Tensor:
+        """World points (N, 3) [m] -> points (N, 3) that the given camera projects as the corrected one does
+        ``positions``.
+
+        A focal factor s is a depth divided by s: pixel and projected radius are those of the longer focal length.
+        """
+        f, c = self.formation, self.cameras[view]
+        rotation, pivot = f.rotations[view], f.pivots[view]
+        relative = positions @ rotation.T + (f.translations[view] - pivot)
+        moved = rotate(c[:3], relative) + c[3:6]
+        depth = relative[:, 2] + pivot[2]
+        stretched = (depth + moved[:, 2]) * torch.exp(-c[6]) - depth
+        return positions + torch.cat([moved[:, :2], stretched[:, None]], dim=1) @ rotation
+
+    def depth(self, view: int, depth: torch.Tensor) -> torch.Tensor:
+        """A rendered depth [m] of ``positions``, as it is before the focal length that stands in it."""
+        return depth * torch.exp(self.cameras[view, 6])
+
+    def rgb(
+        self, view: int, frame: int, rgb: torch.Tensor, alpha: torch.Tensor, background: torch.Tensor
+    ) -> torch.Tensor:
+        """A rendering (H, W, 3) over ``background`` (3,) as this image's exposure records it.
+
+        The exposure acts on the object, in proportion to ``alpha`` (H, W). The background is drawn at random.
+        """
+        e, behind = self.exposures[view, frame], (1 - alpha)[..., None] * background
+        return (rgb - behind) * torch.exp(e[:3]) + alpha[..., None] * e[3] + behind
+
+    def penalty(self) -> torch.Tensor:
+        """Negative logarithm of the Gaussian prior, a scalar.
+
+        The prior is of a camera's rotation and translation at its own centre, which a rotation about the object moves.
+        """
+        f, config = self.formation, self.formation.config
+        rotation = self.cameras[:, :3]
+        shift = self.cameras[:, 3:6] + torch.linalg.cross(f.pivots, rotation)
+        at_camera = torch.cat([rotation, shift, self.cameras[:, 6:]], dim=1)
+        total = (at_camera / f.prior_deviations).square().sum()
+        total = total + (self.exposures[..., :3] / config.log_gain).square().sum()
+        return 0.5 * (total + (self.exposures[..., 3] / config.offset).square().sum())
+
+
+def rotate(vector: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """(R - 1) ``points`` (N, 3), R the rotation by ``vector`` (3,) [rad] (Rodrigues' formula); exact at zero."""
+    square = vector.square().sum()
+    small = square < 1e-8
+    angle = torch.where(small, torch.ones_like(square), square).sqrt()
+    first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
+    second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / angle.square())
+    across = torch.linalg.cross(vector.expand_as(points), points)
+    return first * across + second * torch.linalg.cross(vector.expand_as(points), across)
+
+
+def prior_deviations(cameras: Sequence[Camera], pivot: np.ndarray, fps: float, config: CalibrationConfig) -> np.ndarray:
+    """Prior standard deviations (V, 8) of rotation [rad] and translation [m] at the camera's centre, log focal factor,
+    clock [s]."""
+    rows = []
+    for camera in cameras:
+        distance = float(np.linalg.norm(camera.centre - pivot))
+        rows.append(
+            [np.radians(config.rotation_deg)] * 3
+            + [config.translation_fraction * distance] * 3
+            + [config.focal_fraction, config.time_frames / fps]
+        )
+    return np.array(rows)
+
+
+def _gauge_free_steps(
+    cameras: Sequence[Camera], pivot: np.ndarray, points: np.ndarray, velocities: np.ndarray, deviations: np.ndarray
+) -> np.ndarray:
+    """The map (8 V, 8 V) from the parameters to the corrections of all cameras."""
+    count = POSE * len(cameras)
+    steps, precision, gauge = np.zeros((count, count)), np.zeros((count, count)), np.zeros((count, POSE))
+    for view, (camera, deviation) in enumerate(zip(cameras, deviations, strict=True)):
+        rows = slice(POSE * view, POSE * (view + 1))
+        rotation = camera.world_to_camera[:3, :3]
+        centre = rotation @ pivot + camera.world_to_camera[:3, 3]
+        at_camera = np.eye(POSE)
+        at_camera[3:6, :3] = _cross_matrix(centre)
+        precision[rows, rows] = at_camera.T @ np.diag(deviation**-2) @ at_camera
+        jacobian = displacement_jacobian(camera, pivot, points, velocities)
+        curvature = np.einsum("pij,pik->jk", jacobian, jacobian) / len(points)
+        # The scale of each quantity is taken out first: radians, metres and seconds have nothing in common.
+        scaled = deviation[:, None] * (curvature + REGISTRATION_NOISE_PX**2 * precision[rows, rows]) * deviation
+        values, vectors = np.linalg.eigh(scaled)
+        steps[rows, rows] = deviation[:, None] * (vectors / np.sqrt(values)) @ vectors.T
+        gauge[rows, :3] = np.vstack([rotation, np.zeros((5, 3))])
+        gauge[rows, 3:6] = np.vstack([np.zeros((3, 3)), rotation, np.zeros((2, 3))])
+        gauge[rows, 6] = [0, 0, 0, *centre, 0, 0]
+        gauge[rows, 7] = [0, 0, 0, 0, 0, 0, 0, 1]
+    weighted = gauge.T @ precision
+    scale = np.sqrt(np.diag(weighted @ gauge))
+    weighted, gauge = weighted / scale[:, None], gauge / scale
+    return steps - gauge @ np.linalg.solve(weighted @ gauge, weighted @ steps)
+
+
+def displacement_jacobian(camera: Camera, pivot: np.ndarray, points: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+    """Derivative (P, 2, 8) of the pixels of ``points`` (P, 3) [m] with respect to the corrections at zero."""
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    x = points @ rotation.T + translation
+    k, depth = camera.intrinsics[:2, :2], x[:, 2]
+    perspective = np.zeros((len(points), 2, 3))
+    perspective[:, 0, 0] = perspective[:, 1, 1] = 1 / depth
+    perspective[:, :, 2] = -x[:, :2] / depth[:, None] ** 2
+    projection = k @ perspective
+    relative = x - (rotation @ pivot + translation)
+    out = np.empty((len(points), 2, POSE))
+    for axis in range(3):
+        out[:, :, axis] = np.einsum("pij,pj->pi", projection, np.cross(np.eye(3)[axis], relative))
+    out[:, :, 3:6] = projection
+    out[:, :, 6] = (x[:, :2] / depth[:, None]) @ k.T
+    out[:, :, 7] = np.einsum("pij,pj->pi", projection, velocities @ rotation.T)
+    return out
+
+
+def _cross_matrix(vector: np.ndarray) -> np.ndarray:
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0.0]])
