@@ -80,7 +80,8 @@ def _thinned(cloud: Cloud, cell: float) -> tuple[np.ndarray, np.ndarray | None]:
 
 def _exterior(away: np.ndarray, below: np.ndarray, radius: float) -> np.ndarray:
     """What can be reached from the border at a distance above ``radius`` [m] from all points and above the ground."""
-    labels, _ = ndimage.label((away > radius) & ~below)
+    labels = np.empty(away.shape, np.int32)
+    ndimage.label((away > radius) & ~below, output=labels)
     border = [labels[0], labels[-1], labels[:, 0], labels[:, -1], labels[:, :, 0], labels[:, :, -1]]
     outside = np.unique(np.concatenate([face.ravel() for face in border]))
     return np.isin(labels, outside[outside > 0])
@@ -128,8 +129,9 @@ def _enclosed_volume(
     if max(enclosed) < _LEAST_ENCLOSED * len(points):
         return np.zeros(away.shape)
     radius, exterior = hulls[next(k for k, n in enumerate(enclosed) if n >= _CLOSED * max(enclosed))]
-    nearest = np.stack(ndimage.distance_transform_edt(~exterior, return_distances=False, return_indices=True), axis=-1)
-    outwards = grid[tuple(np.moveaxis(nearest[tuple(index.T)], -1, 0))] - points
+    nearest = np.empty((3, *away.shape), np.int32)
+    ndimage.distance_transform_edt(~exterior, return_distances=False, return_indices=True, indices=nearest)
+    outwards = grid[tuple(nearest[(slice(None), *index.T)])] - points
     if normals is None:
         normals = _normals(points, outwards)
     near = away <= radius + voxel

@@ -138,8 +138,9 @@ def _smoothed(depth: np.ndarray, on_object: np.ndarray) -> np.ndarray:
 def _without_holes(depth: np.ndarray, on_object: np.ndarray) -> np.ndarray:
     """``depth`` with that of the nearest known pixel of the object where the object's is unknown."""
     known = on_object & (depth > 0)
-    row, column = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return np.where(on_object & ~known, depth[row, column], depth)
+    nearest = np.empty((2, *depth.shape), np.int32)
+    ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True, indices=nearest)
+    return np.where(on_object & ~known, depth[tuple(nearest)], depth)
 
 
 def _guessed_back(view: Silhouette, on_object: np.ndarray, depth: np.ndarray) -> np.ndarray:

@@ -110,7 +110,8 @@ def _load(files: tuple[Path, ...], declaration: SceneDeclaration, frame: int) ->
     if kept.sum() < MIN_POINTS:
         inside = "" if corners is None else " in the crop_box of scene.yaml"
         raise InputError(f"{files[frame]} has {int(kept.sum())} points{inside}: a shape needs {MIN_POINTS} or more")
-    return Cloud(*(None if rows is None else rows[kept] for rows in (cloud.points, cloud.normals, cloud.colours)))
+    normals, colours = (None if rows is None else rows[kept] for rows in (cloud.normals, cloud.colours))
+    return Cloud(cloud.points[kept], normals, colours)
 
 
 def _columns(rows: np.ndarray, *names: str) -> np.ndarray | None:

@@ -62,7 +62,8 @@ class CloudLoss:
         tree = cKDTree(points)
         if normals is None:
             normals = estimated_normals(points, tree)
-        return cls(tree, *(torch.tensor(rows, dtype=torch.float32) for rows in (points, normals)), point_spacing(tree))
+        rows, across = torch.tensor(points, dtype=torch.float32), torch.tensor(normals, dtype=torch.float32)
+        return cls(tree, rows, across, point_spacing(tree))
 
     def __call__(self, moved: torch.Tensor) -> torch.Tensor:
         """Mean distance [m] of ``moved`` (M, 3) [m] to the cloud plus that of the cloud to ``moved``, a scalar.

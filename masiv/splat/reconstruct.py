@@ -94,7 +94,7 @@ class _Fit:
             self.objective = cloud_objective(
                 scene, config, range(scene.frame_count), config.gaussians, initial.scale, initial.half_extent
             )
-            self.images = self.objective.images
+            self.images = [self.objective.images[frame] for frame in range(scene.frame_count)]
             return initial
         self.images = observed_images(scene, config, range(scene.frame_count))
         progress("reconstruct", 0, config.iterations, "carving hulls")
