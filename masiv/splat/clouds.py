@@ -25,11 +25,12 @@ from masiv.splat.objective import Objective, Part
 
 TANGENTIAL = 0.01
 """Weight of a match along the surface, where the weight along the normal is 1. It keeps points on a cloud's edge."""
-STIFFER = 100.0
+STIFFER = 50.0
 """Factor of the weight of strain while frames are added; it falls to 1 at the end, as in non-rigid ICP (Amberg et al.
-2007). A soft field lets points slide over the surface in place of turning with it: an ellipsoid of 0.3, 0.2 and 0.12 m
-that spins with 1.4 rad/s is tracked with an error of 40 mm after 5 frames with a factor of 1, 10 mm with 30 and 3 mm
-with 100 (tests/cloud_scene.py)."""
+2007). A soft field lets points slide over the surface in place of turning with it, a stiff one lets them slide at an
+impact. Chosen with an ellipsoid that spins (tests/cloud_scene.py; 600 steps: 36 mm off after 5 frames with a factor of
+10, 10 mm with 30, 6 mm with 50, 3 mm with 100) and one soft body that hits the ground (10 mm with 30, 13 mm with 100,
+18 mm with 300): more bodies would be needed to derive it."""
 SOFTENING = 0.1
 """Distance, in spacings, below which the loss of a match is a square: a smaller one is noise."""
 _NEIGHBOURS = 16
