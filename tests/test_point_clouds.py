@@ -24,7 +24,7 @@ from masiv.splat.clouds import CloudLoss, centroid, even_subset
 
 FRAMES = 5
 TINY = {
-    "reconstruct": {"gaussians": 600, "iterations": 400, "width": 32, "depth": 2, "processes": 1},
+    "reconstruct": {"gaussians": 600, "iterations": 300, "width": 32, "depth": 2, "processes": 1},
     "trajectory": {"particle_count": 500, "fill_resolution": 24, "iterations": 60},
     "simulator": SMALL.model_dump(exclude_defaults=True),
     "identify": {"start": "jelly", "contact": "sticky", "search_particles": 150, "iterations": 2, "processes": 1},
@@ -178,6 +178,7 @@ def test_trajectory_tracks_the_truth(followed):
     assert trajectory.volume == pytest.approx(VOLUME, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_whole_job_without_a_picture(tmp_path, taichi):
     """inspect, identify with held-out frames, evaluate, simulate and the report."""
     from masiv.pipeline import Overrides, SceneRequest, SimulateRequest, inspect_scene, open_run, reopen_run

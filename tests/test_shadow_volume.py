@@ -83,7 +83,9 @@ def test_an_arch_stands_where_the_silhouette_needs_it():
     flat = [(i, j) for i in range(-8, 8) for j in range(12) if j >= 9 or not -5 <= i < 5]
     points = size * np.array([(i + 0.5, j + 0.5, k - 0.5) for k in (0, 1) for i, j in flat])
     camera = look_at("front", np.array([0.0, 0.0, far]), np.zeros(3), 96, 2 * far / size)
-    view = Silhouette(0, camera, np.full((96, 96), -1.0, np.float32), np.ones((96, 96), bool))
+    view = Silhouette(
+        0, camera, np.full((96, 96), -1.0, np.float32), np.ones((96, 96), np.float32), np.ones((96, 96), bool)
+    )
     stays = keep_lowest_voxels(points, size, (view,), np.array([0.0, 1.0, 0.0]), 0.0)
     assert stays.sum() == len(flat)
     np.testing.assert_array_equal(np.unique(points[stays][:, :2], axis=0), np.unique(points[:, :2], axis=0))

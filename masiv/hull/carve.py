@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -10,6 +10,7 @@ from scipy import ndimage
 from masiv.errors import MasivError
 from masiv.hull.depth import DepthView, depth_views, seen_points
 from masiv.hull.silhouette import Silhouette, silhouettes
+from masiv.hull.votes import consensus, vote
 from masiv.scene.scene import Ground, Scene
 
 _COARSE = 24
@@ -50,41 +51,56 @@ def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull
             f"frame {frame} of {scene.path}: the object is in the mask of {len(occupied_views)} of {len(views)} views, "
             "a visual hull needs 2, or 1 with depth; check the masks of that frame"
         )
+    grid = occupancy_grid(views, scene, frame, resolution, depths)
+    occupied = occupancy(views, grid.points, 0.25 * grid.spacing, grid.spacing, scene.ground, depths)
+    occupied = occupied.reshape(grid.counts)
+    if not occupied.any():
+        raise MasivError(_no_volume(views, occupied_views, scene, frame))
+    return VisualHull(grid.points[occupied.ravel()], grid.spacing, surface_of(occupied)[occupied])
+
+
+@dataclass(frozen=True)
+class OccupancyGrid:
+    """Voxels around the object: centres ``points`` (N, 3) [m] of ``counts`` (3,) voxels with side ``spacing`` [m]."""
+
+    points: np.ndarray
+    spacing: float
+    counts: np.ndarray
+
+
+def occupancy_grid(
+    views: tuple[Silhouette, ...], scene: Scene, frame: int, resolution: int, depths: tuple[DepthView, ...] = ()
+) -> OccupancyGrid:
+    """The grid of the hull's bounding box, whose longest side has ``resolution`` voxels.
+
+    Raises MasivError if the box is empty.
+    """
+    occupied_views = [view for view in views if (view.distance < 0).any()]
     lower, upper = _object_box(views, occupied_views, depths, scene.ground, frame, scene)
     spacing = float((upper - lower).max()) / resolution
     counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
-    grid = _cell_centres(lower, spacing, counts)
-    occupied = occupancy(views, grid, 0.25 * spacing, scene.ground, depths).reshape(counts)
-    if not occupied.any():
-        raise MasivError(_no_volume(views, occupied_views, scene, frame))
-    return VisualHull(grid[occupied.ravel()], spacing, surface_of(occupied)[occupied])
+    return OccupancyGrid(_cell_centres(lower, spacing, counts), spacing, counts)
 
 
 def occupancy(
     views: tuple[Silhouette, ...],
     points: np.ndarray,
     tolerance: float,
+    spacing: float,
     ground: Ground | None = None,
     depths: tuple[DepthView, ...] = (),
 ) -> np.ndarray:
-    """Which world points (N, 3) [m] are within ``tolerance`` [m] of every silhouette and above the ground, (N,) bool.
+    """Which voxels with centres ``points`` (N, 3) [m] and side ``spacing`` [m] belong to the hull, (N,) bool.
 
-    A point must be inside the image of at least two views (one of those with depth) and of half of them, and not in
-    front of what ``depths`` show.
+    A voxel is above the ground, inside the image of at least two views (one of those with depth) and of half of them,
+    and at most ``tolerance`` [m] outside of every mask, except where the views outvote one of them: see
+    ``masiv.hull.votes``. It is at most ``tolerance`` in front of what ``depths`` show.
     """
-    kept = np.ones(len(points), bool)
-    if ground is not None:
-        kept &= points @ ground.normal >= ground.height - 0.5 * tolerance
-    shown = np.zeros(len(points), np.int32)
-    for view in views:
-        alive = np.flatnonzero(kept)
-        distance, inside_image, _ = view.distances(points[alive])
-        shown[alive] += inside_image
-        kept[alive] = distance <= tolerance
+    votes = vote(views, points, tolerance, ground, spacing, fewest_views=1 if depths else 2)
     for depth in depths:
-        alive = np.flatnonzero(kept)
-        kept[alive] = np.maximum(depth.in_front(points[alive]), depth.behind(points[alive])) <= tolerance
-    return kept & (shown >= max(1 if depths else 2, len(views) // 2))
+        empty = np.maximum(depth.in_front(points), depth.behind(points)) > tolerance
+        votes = replace(votes, allowed=votes.allowed & ~empty)
+    return consensus(views, votes, points, spacing)
 
 
 def surface_of(occupied: np.ndarray) -> np.ndarray:
@@ -102,7 +118,7 @@ def _object_box(views, seen, depths, ground, frame: int, scene: Scene) -> tuple[
         counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
         grid = _cell_centres(lower, spacing, counts)
         # Half of a cell's diagonal: no cell that contains a part of the object is removed.
-        kept = grid[occupancy(views, grid, 0.87 * spacing, ground, depths)]
+        kept = grid[occupancy(views, grid, 0.87 * spacing, spacing, ground, depths)]
         if len(kept) == 0:
             raise MasivError(_no_volume(views, seen, scene, frame))
         lower, upper = (
@@ -154,7 +170,9 @@ def _no_volume(views, seen: list[Silhouette], scene: Scene, frame: int) -> str:
     spacing = 2 * radius / _COARSE
     grid = _cell_centres(centre - radius, spacing, np.full(3, _COARSE))
     left = {
-        view.view: int(occupancy(tuple(v for v in views if v is not view), grid, 0.5 * spacing, scene.ground).sum())
+        view.view: int(
+            occupancy(tuple(v for v in views if v is not view), grid, 0.5 * spacing, spacing, scene.ground).sum()
+        )
         for view in views
     }
     worst = max(left, key=lambda view: left[view])

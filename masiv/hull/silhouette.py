@@ -13,11 +13,16 @@ from masiv.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Silhouette:
-    """One view of one frame: distance (H, W) float32 [pixels] to the mask's edge, negative on it; valid (H, W) bool."""
+    """One view of one frame.
+
+    distance (H, W) float32 [pixels] to the mask's edge, negative on it. confidence (H, W) float32 in [0, 1] of the
+    mask: 0 where object and background are equally probable. valid (H, W) bool.
+    """
 
     view: int
     camera: Camera
     distance: np.ndarray
+    confidence: np.ndarray
     valid: np.ndarray
 
     def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -42,7 +47,17 @@ class Silhouette:
 def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
     """The silhouettes of ``frame`` in every view that is not held out."""
     pictures = ((view, scene.frame(view, frame)) for view in scene.views)
-    return tuple(Silhouette(view, scene.cameras[view], signed_distance(p.mask), p.valid) for view, p in pictures)
+    return tuple(silhouette(view, scene.cameras[view], p.mask, p.valid) for view, p in pictures)
+
+
+def silhouette(view: int, camera: Camera, mask: np.ndarray, valid: np.ndarray) -> Silhouette:
+    """The silhouette of ``mask`` (H, W) in [0, 1].
+
+    A pixel at the outline shows both object and background. Its mask is near one half, but the outline is certain if it
+    is next to pixels that are.
+    """
+    confidence = cv2.dilate(np.abs(2 * mask - 1).astype(np.float32), np.ones((3, 3), np.uint8))
+    return Silhouette(view, camera, signed_distance(mask), confidence, valid)
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:

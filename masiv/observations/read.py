@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from masiv.errors import InputError
+from masiv.hull.consistent_masks import consistent_masks
 from masiv.scene import (
     blender,
     nerfstudio,
@@ -44,11 +46,17 @@ def read_observation(path: str | Path) -> Scene | Tracks:
     path = Path(path)
     for layout in LAYOUTS:
         if layout.can_read(path):
-            return layout.read(path)
+            found = layout.read(path)
+            return found if isinstance(found, Tracks) else _with_consistent_masks(found)
     if not path.is_dir():
         raise InputError(f"{path} is not a folder: give the folder of a scene")
     known = "; ".join(f"{layout.files} ({layout.name})" for layout in LAYOUTS)
     raise InputError(f"{path} has no known scene layout: looked for {known}")
+
+
+def _with_consistent_masks(scene: Scene) -> Scene:
+    """Masks that are estimated from colours are made consistent over the views. Given ones are not changed."""
+    return replace(scene, correct_masks=consistent_masks) if scene.masks_estimated else scene
 
 
 def read_scene(path: str | Path) -> Scene:

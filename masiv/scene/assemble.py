@@ -67,6 +67,7 @@ def assemble(
         density=declaration.density or conventions.density,
         load=pictures.load,
         mask_source=source,
+        masks_estimated=any(mask.kind in ("background", "plain") for mask in pictures.masks.values()),
         background=pictures.background,
         problems=(*problems, *guesses(declaration, conventions), *gaps, *more, *pictures.depth_problems()),
         fit_frames=declaration.fit_frames,

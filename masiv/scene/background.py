@@ -1,9 +1,9 @@
 """Masks by background subtraction: the probability that a pixel shows the object, not the empty scene of its view.
 
-A view without the object has colour B at a pixel. A picture of it has noise: of the sensor, and of JPEG, which is larger
-near the object, since a block with an edge in it is coded worse. Light may change between pictures, and the object throws
-soft shadows. The object has colours that all views and frames share. Noise, shadows and colours are learnt from the
-recording; a Markov random field then decides about neighbours together.
+A view without the object has colour B at a pixel. A picture of it has noise: of the sensor, and of JPEG, which is
+larger near the object, since a block with an edge in it is coded worse. Light may change between pictures, and the
+object throws soft shadows. The object has colours that all views and frames share. Noise, shadows and colours are
+learnt from the recording; a Markov random field then decides about neighbours together.
 
 Pictures are (H, W, 3) RGB, masks (H, W) float32 in [0, 1].
 """
@@ -19,13 +19,13 @@ from scipy import ndimage
 
 from masiv.scene.markov import smooth_labels
 
-_BINS = 32
+_BINS = 64
 """Of the histogram of the object's colours, along each channel."""
 _DEGREES_OF_FREEDOM = 5.0
 """Of Student's t distribution of the noise: its tails allow for JPEG blocks, which are no Gaussian noise."""
 _SHADOW_PRIOR, _DEEPEST_SHADOW = 0.15, 0.7
 """Prior probability that the background is in shadow, and the largest share of light that a shadow takes."""
-_CAST_SD, _CAST_SD_NEAR = 2.0, 3.5
+_CAST_SD, _CAST_SD_NEAR = 2.0, 3.0
 """Standard deviation of the colour of a shadow about the scene's mean cast [grey levels], and near the object, which
 throws its own colour into its shadow. Measured on path-traced scenes: 2 and 3 grey levels."""
 _OUTLIER_SHARE = 0.3
@@ -53,7 +53,8 @@ class BackgroundModel:
     """What the pictures of a recording have in common.
 
     backgrounds: (H, W, 3) float32 for each view. shadow_cast (3,): share of light that a shadow takes from each channel
-    over its mean. log_colours (_BINS, _BINS, _BINS): log density of the object's colours. prior: log-odds of the object.
+    over its mean. log_colours (_BINS, _BINS, _BINS): log density of the object's colours. prior: log-odds of the
+    object.
     """
 
     backgrounds: dict[int, np.ndarray]
@@ -63,7 +64,7 @@ class BackgroundModel:
     prior: float
 
     def mask(self, view: int, image: np.ndarray) -> np.ndarray:
-        """The probability (H, W) float32 that a pixel of ``image`` shows the object; at its outline, its share of it."""
+        """The probability (H, W) float32 that a pixel of ``image`` shows the object; its share at the outline."""
         empty = self.backgrounds[view]
         picture = _with_light_of(image.astype(np.float32), empty)
         far = self._log_odds(picture, empty, self.noise.far, _CAST_SD)[0]

@@ -74,6 +74,7 @@ class Calibration:
         """corrections: of ``scene.views``, about ``pivot`` (3,) [m]. points (P, 3) [m]: of the object."""
         by_view = dict(zip(scene.views, corrections, strict=True))
         every = [by_view.get(view, NO_CORRECTION) for view in range(len(scene.cameras))]
+        known = scene.time_offsets or (0.0,) * len(scene.cameras)
         refined = tuple(
             corrected_camera(camera, by_view[view], pivot) if view in by_view else camera
             for view, camera in enumerate(scene.cameras)
@@ -85,7 +86,7 @@ class Calibration:
         return cls(
             scene.cameras,
             refined,
-            tuple(correction.time_offset for correction in every),
+            tuple(offset + correction.time_offset for offset, correction in zip(known, every, strict=True)),
             tuple(float(np.sqrt((m**2).sum(axis=1).mean())) for m in moved),
         )
 

@@ -50,12 +50,17 @@ class FrameCache:
             self._frames.move_to_end(key)
             return self._frames[key]
         found = self.load(view, frame)
-        self._frames[key] = found
+        self.put(view, frame, found)
+        return found
+
+    def put(self, view: int, frame: int, found: Frame) -> None:
+        """Keep a frame that was read otherwise."""
+        self._bytes -= self._frames[view, frame].nbytes if (view, frame) in self._frames else 0
+        self._frames[view, frame] = found
         self._bytes += found.nbytes
         while self._bytes > self.max_bytes and len(self._frames) > 1:
             _, oldest = self._frames.popitem(last=False)
             self._bytes -= oldest.nbytes
-        return found
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled without its frames: another process reads those that it needs."""

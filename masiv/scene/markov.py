@@ -15,9 +15,9 @@ _ITERATIONS = 12
 def smooth_labels(log_odds: np.ndarray, image: np.ndarray) -> np.ndarray:
     """Marginal probabilities (H, W) float32 of label 1, by mean-field iteration with damping.
 
-    log_odds (H, W) float32 of each pixel alone; image (H, W, 3) float32. The coupling of two neighbours falls with their
-    difference in colour, as in GrabCut (Rother et al. 2004). The iteration starts from blurred log-odds: single pixels
-    cannot begin a region.
+    log_odds (H, W) float32 of each pixel alone; image (H, W, 3) float32. The coupling of two neighbours falls with
+    their difference in colour, as in GrabCut (Rother et al. 2004). The iteration starts from blurred log-odds: single
+    pixels cannot begin a region.
     """
     colours = cv2.GaussianBlur(image, (0, 0), 1.0)
     squares = [((colours - _shifted(colours, dy, dx)) ** 2).sum(-1) for dy, dx in _NEIGHBOURS]

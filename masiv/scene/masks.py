@@ -1,4 +1,4 @@
-"""Masks of the object: from a cut-out, from the empty background, or from a plain background.
+"""Masks of the object from a cut-out or from a plain background. Those from the empty scene: ``background``.
 
 Pictures are (H, W, 3) uint8 RGB; masks are (H, W) float32 in [0, 1], 1 on the object.
 """
@@ -28,21 +28,6 @@ def from_white(cutout: np.ndarray, image: np.ndarray) -> np.ndarray:
     return mask.astype(np.float32)
 
 
-def from_background(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Mask from the difference to the empty background, refined along colour edges.
-
-    A soft shadow darkens all channels by the same factor, so pixels that are a darker copy of the background belong to
-    it. GrabCut (Rother et al. 2004) then decides about uncertain pixels near the edge.
-    """
-    light, empty = _blur(image), _blur(background)
-    gain = (light * empty).sum(-1) / np.maximum((empty * empty).sum(-1), 1.0)
-    dimmed = np.abs(light - gain[..., None] * empty).max(axis=-1)
-    difference = np.abs(light - empty).max(axis=-1)
-    noise = 1.4826 * np.median(difference) + 1.0
-    shadow = (gain > 0.35) & (gain < 1.05) & (dimmed < max(3.0 * noise, 8.0))
-    return _refine(image, difference, noise, shadow)
-
-
 def from_plain_background(image: np.ndarray) -> np.ndarray:
     """Mask from the difference to the median colour of the picture's border, for a plain background."""
     border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
@@ -50,31 +35,6 @@ def from_plain_background(image: np.ndarray) -> np.ndarray:
     difference = np.abs(image.astype(np.float32) - colour).max(axis=-1)
     noise = 1.4826 * np.median(np.abs(border - colour).max(axis=-1)) + 1.0
     return _clean(difference > max(4.0 * noise, 16.0)).astype(np.float32)
-
-
-def _blur(image: np.ndarray) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32)
-
-
-def _refine(image: np.ndarray, difference: np.ndarray, noise: float, shadow: np.ndarray) -> np.ndarray:
-    seed = _clean((difference > max(6.0 * noise, 20.0)) & ~shadow)
-    if seed.sum() < 16:
-        return seed.astype(np.float32)
-    kernel = np.ones((3, 3), np.uint8)
-    around = cv2.dilate(seed.astype(np.uint8), kernel, iterations=3).astype(bool)
-    sure = cv2.erode(seed.astype(np.uint8), kernel, iterations=2).astype(bool)
-    changed = difference > 3.0 * noise
-    trimap = np.full(seed.shape, cv2.GC_BGD, np.uint8)
-    trimap[around & changed] = cv2.GC_PR_BGD
-    trimap[seed] = cv2.GC_PR_FGD
-    trimap[sure] = cv2.GC_FGD
-    cv2.setRNGSeed(0)  # GrabCut's colour clusters start from OpenCV's random numbers
-    bgr = np.ascontiguousarray(image[..., ::-1])
-    try:
-        cv2.grabCut(bgr, trimap, (0, 0, 0, 0), np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
-    except cv2.error:
-        return seed.astype(np.float32)  # one class is empty: nothing to refine
-    return _clean((trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)).astype(np.float32)
 
 
 def _clean(mask: np.ndarray) -> np.ndarray:

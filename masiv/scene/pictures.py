@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -13,12 +13,15 @@ import numpy as np
 
 from masiv.errors import InputError
 from masiv.scene import depth_masks, masks
+from masiv.scene.background import BackgroundModel, learn_background
 from masiv.scene.camera import Camera
 from masiv.scene.depth import MILLIMETRE, DepthNoise, depth_size, read_depth
 from masiv.scene.lens import Lens
 from masiv.scene.scene import Frame
 
 OCCLUDER_ALPHA = 50
+MAX_LEARNT, MAX_LEARNT_A_VIEW = 72, 6
+"""Pictures from which the noise and the light of a recording are learnt, in all and of one view."""
 Key = tuple[int, int]  # camera index, frame
 
 
@@ -145,10 +148,28 @@ class Pictures:
         if source.kind == "cutout" and other is not None:
             return masks.from_white(other[..., :3], colour)
         if source.kind == "background":
-            return masks.from_background(colour, self._read(view, self.backgrounds[view])[..., :3])
+            return self._background_model.mask(view, colour)
         if source.kind == "depth" and depth is not None:
             return depth_masks.from_empty_depth(depth, self._depth(view, self.empty_depths[view]), self.depth_noise)
         return masks.from_plain_background(colour)
+
+    @cached_property
+    def _background_model(self) -> BackgroundModel:
+        """Learnt from some pictures of each view whose mask is the difference from the empty scene."""
+        frames: dict[int, list[int]] = {}
+        for (view, frame), source in sorted(self.masks.items(), key=lambda item: item[0]):
+            if source.kind == "background":
+                frames.setdefault(view, []).append(frame)
+        count = min(MAX_LEARNT_A_VIEW, max(2, MAX_LEARNT // len(frames)))
+        chosen = {
+            view: [known[i] for i in np.unique(np.linspace(0, len(known) - 1, count).round().astype(int))]
+            for view, known in frames.items()
+        }
+        images = {
+            view: np.stack([self._read(view, self.paths[view, frame])[..., :3] for frame in known])
+            for view, known in chosen.items()
+        }
+        return learn_background(images, {view: self._read(view, self.backgrounds[view])[..., :3] for view in frames})
 
     def _read(self, view: int, path: Path) -> np.ndarray:
         pixels = read_pixels(path)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,10 +36,13 @@ class Scene:
     Frames are 0 … frame_count-1, at the times frame / fps. gravity (3,) [m/s²]; up (3,) unit vector; density [kg/m³].
     ``load(view, frame)`` reads a picture and keeps those that were read last (``FrameCache``); ``frame(view, frame)``
     also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
-    hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences for the user.
+    mask_source: where masks come from, for messages. masks_estimated: from colours, none was given.
+    correct_masks: makes the masks of the views of one frame agree, see ``masiv.hull.consistent_masks``; None for masks
+    that are given. hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences
+    for the user. time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps +
+    offset.
     depth_noise: None if the pictures have no depth. ``load_cloud(frame)``: for a recording of point clouds, which has
     no cameras; ``cloud(frame)`` also checks that this scene contains it.
-    time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
     """
 
     path: Path
@@ -51,8 +56,10 @@ class Scene:
     density: float
     load: Callable[[int, int], Frame]
     mask_source: str
+    masks_estimated: bool = False
     background: Callable[[int], np.ndarray | None] = _unknown_background
     problems: tuple[str, ...] = ()
+    correct_masks: Callable[[Scene, int], Mapping[int, Frame]] | None = None
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
     depth_noise: DepthNoise | None = None
@@ -62,6 +69,10 @@ class Scene:
     def __post_init__(self) -> None:
         if not isinstance(self.load, FrameCache):
             object.__setattr__(self, "load", FrameCache(self.load))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickled without corrected masks: another process makes those that it needs."""
+        return {name: value for name, value in self.__dict__.items() if name != "_corrected"}
 
     @property
     def times(self) -> np.ndarray:
@@ -73,6 +84,11 @@ class Scene:
         """Indices of the cameras that are not held out."""
         return tuple(v for v in range(len(self.cameras)) if v not in self.hidden_views)
 
+    @property
+    def view_time_offsets(self) -> tuple[float, ...]:
+        """``time_offsets`` [s] of ``views``; empty if all clocks are exact."""
+        return tuple(self.time_offsets[view] for view in self.views) if any(self.time_offsets) else ()
+
     def frame(self, view: int, frame: int) -> Frame:
         """The picture of ``view`` at ``frame``; ``valid`` is False everywhere if there is none.
 
@@ -80,7 +96,19 @@ class Scene:
         """
         if not 0 <= frame < self.frame_count or view not in self.views:
             raise InputError(f"view {view}, frame {frame} of {self.path} is held out from this stage or does not exist")
-        return self.load(view, frame)
+        return self.load(view, frame) if self.correct_masks is None else self._corrected(view, frame)
+
+    @cached_property
+    def _corrected(self) -> FrameCache:
+        def corrected(view: int, frame: int) -> Frame:
+            assert self.correct_masks is not None
+            found = self.correct_masks(replace(self, correct_masks=None), frame)
+            for other, picture in found.items():
+                cache.put(other, frame, picture)
+            return found[view]
+
+        cache = FrameCache(corrected)
+        return cache
 
     def cloud(self, frame: int) -> Cloud:
         """The point cloud of ``frame``. Raises InputError if the frame is held out, or the recording has no clouds."""

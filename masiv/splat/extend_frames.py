@@ -57,6 +57,8 @@ def extend_frames(
 ) -> DynamicGaussians:
     """``dynamic``, fitted to the first frames of ``scene``, with a motion over all frames.
 
+    Cameras are not refined further: ``scene`` has those that were refined with ``dynamic``, and their clocks.
+
     A new network is first fitted to the known motion, without images. Then the new frames are added one after the
     other, as in ``reconstruct``, with a loss that keeps the known motion. Needs ``masiv.runtime.start``.
     Raises InputError if ``scene`` has no further frame, MasivError if a frame does not show the object or the fit
@@ -127,7 +129,9 @@ class _ExtensionFit:
         first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
         hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
         losses = {frame: HullLoss(hull) for frame, hull in zip(new, hulls[1:], strict=True)}
-        self.objective = Objective(config, scale, self.half_extent, scene.fps, scene.ground, losses, self.images)
+        self.objective = Objective(
+            config, scale, self.half_extent, scene.fps, scene.ground, losses, self.images, scene.view_time_offsets
+        )
         return torch.tensor(np.stack([h.points.mean(axis=0) for h in hulls]), dtype=torch.float32)
 
     def _begin(self, known: DeformationNetwork, centroids: torch.Tensor, *, pretrain: bool) -> None:

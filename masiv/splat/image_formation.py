@@ -32,9 +32,10 @@ class ImageFormation(torch.nn.Module):
 
     ``pose`` (V, 8) are coordinates in which a step of one moves the object by about a pixel in its picture, or by one
     prior standard deviation. From them a linear map makes rotation about the object's centre, translation, focal length
-    and clock. The map leaves out what no picture determines: a rigid motion and scaling of all cameras, and a common
-    delay. So the mean of the corrections, with the prior's weights, has none of it. The mean gain and offset of all
-    images are zero too. All parameters are float32.
+    and clock. The map leaves out what no picture determines: a rigid motion and scaling of the world, and a common
+    delay. What is left displaces the object in all pictures together as little like one of these as it can (least
+    squares in pixels, and the prior where pixels do not tell). The mean gain and offset of all images are zero too. All
+    parameters are float32.
     """
 
     linear: torch.Tensor
@@ -98,9 +99,9 @@ class Corrections:
     cameras: torch.Tensor
     exposures: torch.Tensor
 
-    def times(self, views: Sequence[int], frames: Sequence[int]) -> torch.Tensor:
-        """When images were taken, (K,) [s]: ``frames`` (K) of ``views`` (K)."""
-        return torch.tensor(frames) / self.formation.fps + self.cameras[list(views), 7]
+    def time_offsets(self, views: Sequence[int]) -> torch.Tensor:
+        """What the clocks of ``views`` (K) add to the times of their images, (K,) [s]."""
+        return self.cameras[list(views), 7]
 
     def positions(self, view: int, positions: torch.Tensor) -> torch.Tensor:
         """World points (N, 3) [m] -> points (N, 3) that the given camera projects as the corrected one does
@@ -174,25 +175,30 @@ def _gauge_free_steps(
 ) -> np.ndarray:
     """The map (8 V, 8 V) from the parameters to the corrections of all cameras."""
     count = POSE * len(cameras)
-    steps, precision, gauge = np.zeros((count, count)), np.zeros((count, count)), np.zeros((count, POSE))
+    steps, metric, gauge = np.zeros((count, count)), np.zeros((count, count)), np.zeros((count, POSE))
     for view, (camera, deviation) in enumerate(zip(cameras, deviations, strict=True)):
         rows = slice(POSE * view, POSE * (view + 1))
         rotation = camera.world_to_camera[:3, :3]
         centre = rotation @ pivot + camera.world_to_camera[:3, 3]
         at_camera = np.eye(POSE)
         at_camera[3:6, :3] = _cross_matrix(centre)
-        precision[rows, rows] = at_camera.T @ np.diag(deviation**-2) @ at_camera
+        precision = at_camera.T @ np.diag(deviation**-2) @ at_camera
         jacobian = displacement_jacobian(camera, pivot, points, velocities)
         curvature = np.einsum("pij,pik->jk", jacobian, jacobian) / len(points)
+        block = curvature + REGISTRATION_NOISE_PX**2 * precision
         # The scale of each quantity is taken out first: radians, metres and seconds have nothing in common.
-        scaled = deviation[:, None] * (curvature + REGISTRATION_NOISE_PX**2 * precision[rows, rows]) * deviation
+        scaled = deviation[:, None] * block * deviation
         values, vectors = np.linalg.eigh(scaled)
         steps[rows, rows] = deviation[:, None] * (vectors / np.sqrt(values)) @ vectors.T
+        # A common delay is that of the clocks' mean, whatever the cameras do.
+        block[7, :7] = block[:7, 7] = 0
+        block[7, 7] = 1
+        metric[rows, rows] = block
         gauge[rows, :3] = np.vstack([rotation, np.zeros((5, 3))])
         gauge[rows, 3:6] = np.vstack([np.zeros((3, 3)), rotation, np.zeros((2, 3))])
         gauge[rows, 6] = [0, 0, 0, *centre, 0, 0]
         gauge[rows, 7] = [0, 0, 0, 0, 0, 0, 0, 1]
-    weighted = gauge.T @ precision
+    weighted = gauge.T @ metric
     scale = np.sqrt(np.diag(weighted @ gauge))
     weighted, gauge = weighted / scale[:, None], gauge / scale
     return steps - gauge @ np.linalg.solve(weighted @ gauge, weighted @ steps)

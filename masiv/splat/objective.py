@@ -61,6 +61,7 @@ class Objective:
     """The loss of a fit.
 
     scale, half_extent [m]: lengths that make the terms dimensionless; fps [1/s]. hulls, images: by frame.
+    time_offsets [s]: of the clocks of the cameras that are fitted; empty if all are exact.
     """
 
     config: ReconstructConfig
@@ -70,6 +71,7 @@ class Objective:
     ground: Ground | None
     hulls: Sequence[HullLoss] | Mapping[int, HullLoss]
     images: Sequence[list[ObservedImage]] | Mapping[int, list[ObservedImage]]
+    time_offsets: tuple[float, ...] = ()
 
     def __call__(
         self,
@@ -170,13 +172,18 @@ class Objective:
         """One moment a frame, or one an image if each camera has its own clock."""
         in_images = [frame for frame, *_ in part.images]
         frames = sorted(set(in_images))
-        if corrected is None:
+        if corrected is None and not self.time_offsets:
             of_image = [frames.index(frame) for frame in in_images]
             of_frame = {frame: row for row, frame in enumerate(frames)}
             return Moments(torch.tensor(frames) / self.fps, of_image, of_frame, moving=frames[-1] > 0)
         views = [self.images[frame][index].view for frame, index, _ in part.images]
         of_frame = {frame: in_images.index(frame) for frame in frames}
-        return Moments(corrected.times(views, in_images), list(range(len(in_images))), of_frame, part.moving)
+        times = torch.tensor(in_images) / self.fps
+        if self.time_offsets:
+            times = times + torch.tensor([self.time_offsets[view] for view in views])
+        if corrected is not None:
+            times = times + corrected.time_offsets(views)
+        return Moments(times, list(range(len(in_images))), of_frame, part.moving)
 
     def _regularization(
         self,

@@ -103,7 +103,14 @@ class _Fit:
         )
         hulls = tuple(HullLoss(hull) for hull in initial.hulls)
         self.objective = Objective(
-            config, initial.scale, initial.half_extent, scene.fps, scene.ground, hulls, self.images
+            config,
+            initial.scale,
+            initial.half_extent,
+            scene.fps,
+            scene.ground,
+            hulls,
+            self.images,
+            scene.view_time_offsets,
         )
         return initial
 
@@ -247,6 +254,8 @@ class _Fit:
             for group in self.optimiser.param_groups:
                 if group["name"] == "means" or (group["name"] == "colour_logits" and self.annealing == 0):
                     group["lr"] *= c.canonical_rate_factor
+                if group["name"] == "cameras" and self.annealing == 0:
+                    group["lr"] *= c.calibration.growth_rate_factor
         parts = self.objective.parts(len(self.parameters["means"]), chosen, 1 - self.annealing, rng)
         value = self._compute_gradients(parts)
         if not np.isfinite(value):
