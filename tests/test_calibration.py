@@ -35,9 +35,7 @@ def object_points():
 
 def formation(dtype=torch.float32):
     points = object_points()
-    made = ImageFormation(
-        CAMERAS, FRAMES, FPS, CalibrationConfig(), points, np.tile(VELOCITY, (len(points), 1)), pixels=300.0
-    )
+    made = ImageFormation(CAMERAS, FRAMES, FPS, CalibrationConfig(), points, np.tile(VELOCITY, (len(points), 1)))
     return made.to(dtype)
 
 

@@ -217,7 +217,7 @@ def test_bad_scene_yaml_is_one_clear_sentence(folder, text, message):
         (lambda d: d.append(d[2]), "listed twice"),
         (lambda d: d[1].update(file_path="data/first.png"), "does not read as"),
         (lambda d: d[1].update(intrinsic=[[0, 0, 0]] * 3), "positive focal"),
-        (lambda d: [d.remove(r) for r in list(d) if r["file_path"].endswith("_1.png")], "frame 1: frames must run"),
+        (lambda d: [d.remove(r) for r in list(d) if r["file_path"].endswith("_0.png")], "any view at frame 0"),
         (lambda d: d.clear(), "must be a list"),
     ],
 )
@@ -232,6 +232,25 @@ def test_a_missing_picture_is_listed_and_invisible(folder):
     scene = read_scene(folder)
     assert any("view 2 has no picture at frame 1" in p for p in scene.problems)
     assert not scene.frame(1, 1).valid.any()
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_frame_that_no_camera_has_is_listed_and_not_observed(folder, listed):
+    if not listed:
+        change(folder, lambda d: [d.remove(r) for r in list(d) if r["file_path"].endswith("_1.png")])
+    for view in (0, 2):
+        (folder / f"data/r_{view}_1.png").unlink()
+    scene = read_scene(folder)
+    assert (scene.frame_count, scene.observed_frames) == (FRAMES, (0, 2))
+    assert scene.problems == ("no camera has a picture at frame 1: the motion is interpolated there",)
+    assert not scene.frame(0, 1).valid.any()
+
+
+def test_a_frame_that_only_a_held_out_camera_has_is_not_observed(folder):
+    (folder / "data/r_0_1.png").unlink()
+    scene = read_scene(folder)
+    assert scene.observed_frames == (0, 1, 2)
+    assert scene.restricted(holdout_cameras=(1,)).observed_frames == (0, 2)
 
 
 def test_pictures_of_different_size_and_broken_pictures(folder):

@@ -10,10 +10,11 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.fill import FilledVolume, fill_volume, hull_volume
+from masiv.continuum.fill import FilledVolume, fill_later_frame, hull_volume
 from masiv.continuum.finetune import KnownMotion, fine_tune
 from masiv.continuum.trajectory import Trajectory, positions_at
 from masiv.errors import InputError, MasivError
+from masiv.hull.velocity import with_velocities
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
@@ -47,12 +48,13 @@ def extend_trajectory(
             f"{scene.path} has {scene.frame_count} frames, the extended motion {motion.frame_count} and the trajectory "
             f"{known}: give the scene and the motion of the same frames, more than the trajectory has"
         )
+    scene = with_velocities(scene, dynamic.base_positions(scene.times))
     start = FilledVolume(trajectory.positions[0].astype(np.float64), trajectory.spacing, trajectory.volume)
     hull = hull_volume(scene, config)
     volumes = []
     for frame in range(known, scene.frame_count):
         progress("fill new frames", frame - known + 1, scene.frame_count - known)
-        volumes.append(fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=hull))
+        volumes.append(fill_later_frame(scene, dynamic, frame, config, start, hull))
     known_motion = KnownMotion(
         torch.from_numpy(trajectory.positions - trajectory.positions[0]),
         _initial_network(motion, dynamic.canonical.means.detach(), trajectory, seed),

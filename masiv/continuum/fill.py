@@ -73,6 +73,20 @@ def hull_volume(scene: Scene, config: TrajectoryConfig) -> float | None:
     return None if scene.load_cloud is not None else visual_hull(scene, 0, resolution=config.fill_resolution).volume
 
 
+def fill_later_frame(
+    scene: Scene,
+    dynamic: DynamicGaussians,
+    frame: int,
+    config: TrajectoryConfig,
+    start: FilledVolume,
+    volume: float | None,
+) -> FilledVolume | None:
+    """``fill_volume``, a little finer than ``start`` fills frame 0; None for a frame without a picture."""
+    if frame not in scene.observed_frames:
+        return None
+    return fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=volume)
+
+
 def density_field(
     scene: Scene,
     dynamic: DynamicGaussians | None,

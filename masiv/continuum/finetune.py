@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -62,7 +62,7 @@ def fine_tune(
     scene: Scene,
     dynamic: DynamicGaussians,
     start: FilledVolume,
-    volumes: list[FilledVolume],
+    volumes: Sequence[FilledVolume | None],
     config: TrajectoryConfig,
     *,
     seed: int,
@@ -71,6 +71,8 @@ def fine_tune(
     known: KnownMotion | None = None,
 ) -> DeformationNetwork:
     """A copy of the motion of ``dynamic`` that moves ``start`` into ``volumes``, one for each frame after 0. Resumable.
+
+    A frame without a picture has no volume: there only the other terms act.
 
     With ``known`` the fit starts at its network and keeps its motion, and ``volumes`` belong to the later frames.
     Raises MasivError if the loss becomes non-finite.
@@ -185,7 +187,7 @@ class _TrajectoryLoss:
         return terms
 
 
-def chamfer_targets(moved: np.ndarray, volumes: list[FilledVolume], start: FilledVolume) -> ChamferTargets:
+def chamfer_targets(moved: np.ndarray, volumes: Sequence[FilledVolume | None], start: FilledVolume) -> ChamferTargets:
     """Chamfer pairs between particles ``moved`` (T, Q, 3) [m] and the T ``volumes``.
 
     mean_i |x_i - v(x_i)|² + mean_j |v_j - x(v_j)|², v(x) and x(v) being nearest neighbours. Pairs nearer than 0.8
@@ -195,6 +197,8 @@ def chamfer_targets(moved: np.ndarray, volumes: list[FilledVolume], start: Fille
     targets, weights = moved.copy(), np.zeros(moved.shape[:2])
     noise = 0.8 * start.spacing
     for t, volume in enumerate(volumes):
+        if volume is None:
+            continue
         count, filled = len(moved[t]), len(volume.points)
         distance, nearest = spatial.cKDTree(volume.points).query(moved[t])
         back, owner = spatial.cKDTree(moved[t]).query(volume.points)

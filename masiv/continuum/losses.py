@@ -11,6 +11,7 @@ import torch
 
 from masiv.hull.silhouette import silhouettes
 from masiv.scene.scene import Ground, Scene
+from masiv.scene.shutter import INSTANT, Shutter
 
 _LARGEST_SIDE = 256
 """Pixels along the longer side of a distance field. Larger ones are reduced: signed distances are smooth."""
@@ -18,11 +19,17 @@ _LARGEST_SIDE = 256
 
 @dataclass(frozen=True)
 class View:
-    """One mask as tensors: signed distance (H, W) [pixels] to its edge, pose (3, 4) [m] and pinhole (3, 3) [pixels]."""
+    """One mask as tensors: signed distance (H, W) [pixels] to its edge, pose (3, 4) [m] and pinhole (3, 3) [pixels].
+
+    velocity (3,) [m/s] of the object, if rows show other times than the frame's: ``shutter``, time_offset [s].
+    """
 
     distance: torch.Tensor
     pose: torch.Tensor
     pinhole: torch.Tensor
+    shutter: Shutter = INSTANT
+    velocity: torch.Tensor | None = None
+    time_offset: float = 0.0
 
 
 def load_views(scene: Scene) -> list[list[View]]:
@@ -42,14 +49,19 @@ def _view(silhouette) -> View:
         pinhole[0] *= columns / width
         pinhole[1] *= rows / height
     pose = torch.as_tensor(silhouette.camera.world_to_camera[:3], dtype=torch.float32)
-    return View(torch.as_tensor(distance, dtype=torch.float32), pose, torch.as_tensor(pinhole, dtype=torch.float32))
+    velocity = None if silhouette.velocity is None else torch.as_tensor(silhouette.velocity, dtype=torch.float32)
+    shutter = silhouette.camera.shutter.reduced(height / distance.shape[0])
+    pinhole = torch.as_tensor(pinhole, dtype=torch.float32)
+    return View(torch.as_tensor(distance), pose, pinhole, shutter, velocity, silhouette.time_offset)
 
 
 def outside_of_mask(positions: torch.Tensor, view: View) -> torch.Tensor:
     """World points (N, 3) [m] -> distance outside of the mask (N,) [m], 0 inside of it or outside of the image."""
-    in_camera = positions @ view.pose[:, :3].T + view.pose[:, 3]
-    depth = in_camera[:, 2].clamp(min=1e-3)
-    pixels = (in_camera @ view.pinhole.T)[:, :2] / depth[:, None]
+    in_camera, depth, pixels = _project(positions, view)
+    if view.velocity is not None:
+        for _ in range(2):
+            read = view.time_offset + view.shutter.row_times(pixels.detach()[:, 1])
+            in_camera, depth, pixels = _project(positions + read[:, None] * view.velocity, view)
     size = pixels.new_tensor([view.distance.shape[1], view.distance.shape[0]])
     grid = 2 * pixels / size - 1
     distance = torch.nn.functional.grid_sample(
@@ -57,6 +69,13 @@ def outside_of_mask(positions: torch.Tensor, view: View) -> torch.Tensor:
     )[0, 0, 0]
     shown = (grid.detach().abs() < 1).all(dim=1) & (in_camera.detach()[:, 2] > 1e-3)
     return torch.where(shown, distance.clamp(min=0) * depth / view.pinhole[0, 0], 0.0)
+
+
+def _project(positions: torch.Tensor, view: View) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """World points (N, 3) [m] -> in the camera's axes (N, 3) [m], depths (N,) [m] and pixels (N, 2)."""
+    in_camera = positions @ view.pose[:, :3].T + view.pose[:, 3]
+    depth = in_camera[:, 2].clamp(min=1e-3)
+    return in_camera, depth, (in_camera @ view.pinhole.T)[:, :2] / depth[:, None]
 
 
 def below_ground(positions: torch.Tensor, ground: Ground) -> torch.Tensor:

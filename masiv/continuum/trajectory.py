@@ -17,10 +17,11 @@ from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.consistency import consistent_particles
 from masiv.continuum.density_field import even_points
-from masiv.continuum.fill import FilledVolume, density_field, fill_volume, hull_volume
+from masiv.continuum.fill import FilledVolume, density_field, fill_later_frame, hull_volume
 from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
 from masiv.files import write_npz
+from masiv.hull.velocity import with_velocities
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
@@ -93,12 +94,13 @@ def estimate_trajectory(
     Held-out views are not used. Raises MasivError if a frame has no volume to fill or the motion becomes non-finite.
     """
     checkpoint = checkpoint or Checkpoint(None)
+    scene = with_velocities(scene, dynamic.base_positions(scene.times))
     start = fill_first_frame(scene, dynamic, config)
     hull = hull_volume(scene, config)
     volumes = []
     for frame in range(1, scene.frame_count):
         progress("fill", frame, scene.frame_count - 1)
-        volumes.append(fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=hull))
+        volumes.append(fill_later_frame(scene, dynamic, frame, config, start, hull))
     network = fine_tune(scene, dynamic, start, volumes, config, seed=seed, checkpoint=checkpoint, progress=progress)
     positions = positions_at(network, start.points, scene.times)
     if not np.isfinite(positions).all():

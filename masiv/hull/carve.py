@@ -100,7 +100,7 @@ def occupancy(
     for depth in depths:
         empty = np.maximum(depth.in_front(points), depth.behind(points)) > tolerance
         votes = replace(votes, allowed=votes.allowed & ~empty)
-    return consensus(views, votes, points, spacing)
+    return consensus(views, votes)
 
 
 def surface_of(occupied: np.ndarray) -> np.ndarray:

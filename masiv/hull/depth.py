@@ -12,7 +12,6 @@ import numpy as np
 from scipy import ndimage
 
 from masiv.hull.silhouette import Silhouette
-from masiv.scene.camera import Camera
 from masiv.scene.depth import back_projected
 from masiv.scene.scene import Scene
 
@@ -33,8 +32,7 @@ class DepthView:
     views bound it.
     """
 
-    view: int
-    camera: Camera
+    silhouette: Silhouette
     depth: np.ndarray
     nearest: np.ndarray
     margin: np.ndarray
@@ -64,7 +62,7 @@ class DepthView:
         return np.where(shown & (back > 0), along - back, -np.inf)
 
     def _pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        pixels, along = self.camera.project(points)
+        pixels, along = self.silhouette.project(points)
         height, width = self.depth.shape
         pixels = np.where((along > 1e-6)[:, None], pixels, -1.0)
         shown = (pixels >= 0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
@@ -96,14 +94,14 @@ def depth_views(scene: Scene, frame: int, views: tuple[Silhouette, ...]) -> tupl
         nearest = np.where(np.isfinite(nearest) & (smooth > 0), nearest, 0.0)
         margin = MARGIN_SIGMAS * scene.depth_noise.std(smooth)
         surface = np.where(on_object, smooth, 0.0)
-        found.append(DepthView(view.view, view.camera, surface, nearest, margin, back))
+        found.append(DepthView(view, surface, nearest, margin, back))
     return tuple(found)
 
 
 def seen_points(depths: tuple[DepthView, ...]) -> np.ndarray:
     """World points (N, 3) [m] of the object's surface that the depth of a frame shows, and of its guessed back."""
-    fronts = [back_projected(view.camera, view.depth) for view in depths]
-    backs = [back_projected(view.camera, view.back) for view in depths if view.back is not None]
+    fronts = [back_projected(view.silhouette.camera, view.depth) for view in depths]
+    backs = [back_projected(view.silhouette.camera, view.back) for view in depths if view.back is not None]
     return np.concatenate([*fronts, *backs])
 
 

@@ -74,7 +74,7 @@ def _pixel_cells(view: Silhouette, points: np.ndarray, spacing: float) -> np.nda
 
     A square is about as wide as the image of a voxel and at least one pixel: smaller ones would leave gaps.
     """
-    pixels, depth = view.camera.project(points)
+    pixels, depth = view.project(points)
     visible = view.distances(points)[2]
     if not visible.any():
         return np.full(len(points), -1)

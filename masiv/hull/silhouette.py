@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,7 +16,8 @@ class Silhouette:
     """One view of one frame.
 
     distance (H, W) float32 [pixels] to the mask's edge, negative on it. confidence (H, W) float32 in [0, 1] of the
-    mask: 0 where object and background are equally probable. valid (H, W) bool.
+    mask: 0 where object and background are equally probable. valid (H, W) bool. velocity (3,) [m/s] of the object if it
+    is known and pixels show other times than the frame's: by a rolling shutter, or a clock with a time_offset [s].
     """
 
     view: int
@@ -24,6 +25,22 @@ class Silhouette:
     distance: np.ndarray
     confidence: np.ndarray
     valid: np.ndarray
+    velocity: np.ndarray | None = None
+    time_offset: float = 0.0
+
+    def with_mask(self, mask: np.ndarray) -> Silhouette:
+        """This view with another ``mask`` (H, W) in [0, 1]."""
+        return replace(self, distance=signed_distance(mask), confidence=_confidence(mask))
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As ``Camera.project``, of points that are at ``points`` at the frame's time and move with ``velocity``."""
+        pixels, depth = self.camera.project(points)
+        if self.velocity is not None:
+            # The row depends on the time and the time on the row: a fixed-point iteration.
+            for _ in range(2):
+                read = self.time_offset + self.camera.shutter.row_times(pixels[:, 1])
+                pixels, depth = self.camera.project(points + read[:, None] * self.velocity)
+        return pixels, depth
 
     def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Signed distances of world points (N, 3) [m] to this silhouette, (N,) [m], measured at each point's depth.
@@ -31,7 +48,7 @@ class Silhouette:
         Negative on the object, 0 for a point that is not visible. Also returns ``inside_image`` (N,) bool and
         ``visible`` (N,) bool: inside the image and not behind an occluder.
         """
-        pixels, depth = self.camera.project(points)
+        pixels, depth = self.project(points)
         height, width = self.distance.shape
         in_front = depth > 1e-6
         pixels = np.where(in_front[:, None], pixels, -1.0)
@@ -46,18 +63,25 @@ class Silhouette:
 
 def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
     """The silhouettes of ``frame`` in every view that is not held out."""
-    pictures = ((view, scene.frame(view, frame)) for view in scene.views)
-    return tuple(silhouette(view, scene.cameras[view], p.mask, p.valid) for view, p in pictures)
+    pictures = ((view, scene.cameras[view], scene.frame(view, frame)) for view in scene.views)
+    found = (silhouette(view, camera, p.mask, p.valid) for view, camera, p in pictures)
+    if scene.velocities is None:
+        return tuple(found)
+    velocity = scene.velocities[frame]
+    return tuple(
+        replace(s, velocity=velocity, time_offset=scene.time_offset(s.view)) if scene.shows_other_times(s.view) else s
+        for s in found
+    )
 
 
 def silhouette(view: int, camera: Camera, mask: np.ndarray, valid: np.ndarray) -> Silhouette:
-    """The silhouette of ``mask`` (H, W) in [0, 1].
+    """The silhouette of ``mask`` (H, W) in [0, 1]."""
+    return Silhouette(view, camera, signed_distance(mask), _confidence(mask), valid)
 
-    A pixel at the outline shows both object and background. Its mask is near one half, but the outline is certain if it
-    is next to pixels that are.
-    """
-    confidence = cv2.dilate(np.abs(2 * mask - 1).astype(np.float32), np.ones((3, 3), np.uint8))
-    return Silhouette(view, camera, signed_distance(mask), confidence, valid)
+
+def _confidence(mask: np.ndarray) -> np.ndarray:
+    """Of each pixel, (H, W) float32. An outline is certain if it is next to pixels that are, though it is half full."""
+    return cv2.dilate(np.abs(2 * mask - 1).astype(np.float32), np.ones((3, 3), np.uint8))
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:

@@ -32,12 +32,13 @@ class Votes:
     """What each of V views says of N voxels.
 
     denied (N, V) float32: confidence of a view that shows the voxel outside of its mask, else 0. cells (N, V): number
-    of the square of pixels that the voxel covers, -1 if the view does not show it. allowed (N,) bool: shown by enough
-    views and above the ground.
+    of the square of pixels that the voxel covers, -1 if the view does not show it. sides (V,): of these squares
+    [pixels]. allowed (N,) bool: shown by enough views and above the ground.
     """
 
     denied: np.ndarray
     cells: np.ndarray
+    sides: tuple[int, ...]
     allowed: np.ndarray
 
     def hull(self) -> np.ndarray:
@@ -62,20 +63,23 @@ def vote(
     denied = np.zeros((len(points), len(views)), np.float32)
     cells = np.full((len(points), len(views)), -1, np.int64)
     shown = np.zeros(len(points), np.int32)
+    sides = []
     for k, view in enumerate(views):
         distance, inside_image, visible = view.distances(points)
         shown += inside_image
-        rows, columns = _pixels(view, points, visible)
-        denied[:, k] = (visible & (distance > tolerance)) * view.confidence[rows, columns]
-        side = cell_side(view, points, visible, spacing)
-        cells[:, k] = np.where(visible, rows // side * _columns(view, side) + columns // side, -1)
+        pixels, depth = view.project(points[visible])
+        columns, rows = np.floor(pixels).astype(np.int64).T
+        denied[visible, k] = (distance[visible] > tolerance) * view.confidence[rows, columns]
+        side = _cell_side(view, depth, spacing)
+        cells[visible, k] = rows // side * _columns(view, side) + columns // side
+        sides.append(side)
     allowed = shown >= max(fewest_views, len(views) // 2)
     if ground is not None:
         allowed &= points @ ground.normal >= ground.height - 0.5 * tolerance
-    return Votes(denied, cells, allowed)
+    return Votes(denied, cells, tuple(sides), allowed)
 
 
-def consensus(views: tuple[Silhouette, ...], votes: Votes, points: np.ndarray, spacing: float) -> np.ndarray:
+def consensus(views: tuple[Silhouette, ...], votes: Votes) -> np.ndarray:
     """The hull (N,) bool with the voxels that one view denies and at least two others need."""
     kept = votes.hull()
     if len(views) < FEWEST_VIEWS or not kept.any():
@@ -86,8 +90,7 @@ def consensus(views: tuple[Silhouette, ...], votes: Votes, points: np.ndarray, s
         return kept
     needed = np.zeros(len(candidates))
     for k, view in enumerate(views):
-        side = cell_side(view, points, votes.cells[:, k] >= 0, spacing)
-        uncovered = _cells_inside(view, side)
+        uncovered = _cells_inside(view, votes.sides[k])
         covering = votes.cells[kept, k]
         uncovered[covering[covering >= 0]] = False
         cell = votes.cells[candidates, k]
@@ -96,12 +99,11 @@ def consensus(views: tuple[Silhouette, ...], votes: Votes, points: np.ndarray, s
     return kept
 
 
-def cell_side(view: Silhouette, points: np.ndarray, visible: np.ndarray, spacing: float) -> int:
-    """Side [pixels] of squares that neighbouring voxels cover without gaps."""
-    if not visible.any():
+def _cell_side(view: Silhouette, depth: np.ndarray, spacing: float) -> int:
+    """Side [pixels] of squares that neighbouring voxels at ``depth`` [m] cover without gaps."""
+    if len(depth) == 0:
         return 1
-    depth = float(np.median(view.camera.project(points[visible])[1]))
-    return max(1, int(np.ceil(1.5 * spacing * view.camera.intrinsics[0, 0] / depth)))
+    return max(1, int(np.ceil(1.5 * spacing * view.camera.intrinsics[0, 0] / float(np.median(depth)))))
 
 
 def _columns(view: Silhouette, side: int) -> int:
@@ -115,9 +117,3 @@ def _cells_inside(view: Silhouette, side: int) -> np.ndarray:
     padded = np.full((rows * side, columns * side), np.inf, np.float32)
     padded[:height, :width] = np.where(view.valid, view.distance, np.inf)
     return (padded.reshape(rows, side, columns, side).max(axis=(1, 3)) <= -_INSIDE).ravel()
-
-
-def _pixels(view: Silhouette, points: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    pixels, _ = view.camera.project(points)
-    whole = np.floor(np.where(visible[:, None], pixels, 0.0)).astype(np.int64)
-    return whole[:, 1], whole[:, 0]

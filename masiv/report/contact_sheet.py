@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -14,12 +15,20 @@ OUTLINE = (255, 60, 0)
 HIDDEN = (90, 90, 200)
 
 
-def contact_sheet(scene: Scene, columns: int = 6, tile: int = 160) -> np.ndarray:
-    """(H, W, 3) uint8 RGB; ``columns`` frames spread over the scene, each picture ``tile`` pixels wide."""
+def contact_sheet(
+    scene: Scene, columns: int = 6, tile: int = 160, notes: Mapping[int, str] | None = None
+) -> np.ndarray:
+    """(H, W, 3) uint8 RGB; ``columns`` frames spread over the scene, each picture ``tile`` pixels wide.
+
+    notes: what is written into the first picture of a view.
+    """
     frames = np.unique(np.linspace(0, scene.frame_count - 1, min(columns, scene.frame_count)).round().astype(int))
     if scene.load_cloud is not None:
         return _clouds(scene, frames, tile)
     rows = [np.concatenate([_tile(scene, view, int(frame), tile) for frame in frames], axis=1) for view in scene.views]
+    for row, view in zip(rows, scene.views, strict=True):
+        if notes and view in notes:
+            _write(row, notes[view], (3, row.shape[0] - 5))
     return np.concatenate(rows, axis=0)
 
 
@@ -46,9 +55,9 @@ def _clouds(scene: Scene, frames: np.ndarray, tile: int) -> np.ndarray:
     return np.concatenate(rows, axis=0)
 
 
-def write_contact_sheet(scene: Scene, path: Path) -> None:
-    """Write ``contact_sheet(scene)`` as a PNG."""
-    write_png(path, contact_sheet(scene))
+def write_contact_sheet(scene: Scene, path: Path, notes: Mapping[int, str] | None = None) -> None:
+    """Write ``contact_sheet(scene, notes=notes)`` as a PNG."""
+    write_png(path, contact_sheet(scene, notes=notes))
 
 
 def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -67,6 +76,10 @@ def _tile(scene: Scene, view: int, frame: int, width: int) -> np.ndarray:
     hidden = cv2.resize((~picture.valid).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     image[hidden] = (image[hidden] // 2 + np.array(HIDDEN, np.uint8) // 2).astype(np.uint8)
     tile = outlined(image, cv2.resize(picture.mask, (width, height), interpolation=cv2.INTER_LINEAR))
-    cv2.putText(tile, f"{view}:{frame}", (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 2, cv2.LINE_AA)
-    cv2.putText(tile, f"{view}:{frame}", (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (255, 255, 255), 1, cv2.LINE_AA)
+    _write(tile, f"{view}:{frame}", (3, 11))
     return tile
+
+
+def _write(image: np.ndarray, text: str, at: tuple[int, int]) -> None:
+    for colour, width in (((0, 0, 0), 2), ((255, 255, 255), 1)):
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.36, colour, width, cv2.LINE_AA)

@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from masiv.calibration.consistency import odd_camera, silhouette_consistency
 from masiv.observations.identity import identity
 from masiv.report.contact_sheet import write_contact_sheet
 from masiv.scene.scene import Scene
@@ -19,6 +22,13 @@ def inspection(read: Scene | Tracks, picture: Path) -> tuple[dict[str, Any], str
         write_tracks_picture(read, picture)
         summary = {**summarise_tracks(read), "picture": str(picture)}
         return summary, tracks_as_text(summary)
-    write_contact_sheet(read, picture)
+    agreement = silhouette_consistency(read)
     summary = {**summarise(read), **identity(read), "picture": str(picture)}
+    for view, error in zip(agreement.views, agreement.pixels, strict=True):
+        summary["cameras"][view]["consistency_px"] = float(error) if np.isfinite(error) else None
+    odd = odd_camera(read, agreement)
+    summary["problems"] += [] if odd is None else [odd]
+    write_contact_sheet(
+        read, picture, {v: f"{e:.1f} px" for v, e in zip(agreement.views, agreement.pixels, strict=True)}
+    )
     return summary, as_text(summary)

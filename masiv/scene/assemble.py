@@ -42,7 +42,9 @@ def assemble(
     problems: Iterable[str] = (),
 ) -> Scene:
     """The scene. Raises InputError for a frame or camera without a picture and for a scene.yaml that does not fit."""
-    cameras = pictures.cameras
+    shutters = declaration.shutters(pictures.cameras, fps)
+    cameras = tuple(replace(c, shutter=s) for c, s in zip(pictures.cameras, shutters, strict=True))
+    pictures = replace(pictures, cameras=cameras)
     if declaration.fit_frames is not None and declaration.fit_frames > frame_count:
         raise InputError(f"scene.yaml: fit_frames is {declaration.fit_frames}, the scene has {frame_count} frames")
     gaps = _gaps(folder, pictures, frame_count)
@@ -72,6 +74,7 @@ def assemble(
         problems=(*problems, *guesses(declaration, conventions), *gaps, *more, *pictures.depth_problems()),
         fit_frames=declaration.fit_frames,
         depth_noise=pictures.depth_noise if pictures.depths else None,
+        missing=frozenset((v, k) for v in range(len(cameras)) for k in range(frame_count)) - pictures.paths.keys(),
     )
 
 
@@ -96,21 +99,25 @@ def _gaps(folder: Path, pictures: Pictures, frame_count: int) -> list[str]:
             raise InputError(f"{folder} has none of the pictures of {camera.name}: remove it from the listing")
         if missing:
             lacking[view] = missing
-    for frame in range(frame_count):
-        if all((view, frame) not in pictures.paths for view in range(len(pictures.cameras))):
-            raise InputError(f"{folder} has no picture of any view at frame {frame}")
+    empty = sorted(set(range(frame_count)) - {frame for _, frame in pictures.paths})
+    if 0 in empty:
+        raise InputError(f"{folder} has no picture of any view at frame 0: the motion begins there, remove it")
     if len(lacking) == len(pictures.cameras) and all(len(gaps) == frame_count - 1 for gaps in lacking.values()):
         return [
             f"every one of the {len(lacking)} cameras sees one frame only, as with one camera that moves: "
             "depth cannot be triangulated at any instant"
         ]
+    lacking = {view: left for view, gaps in lacking.items() if (left := [k for k in gaps if k not in empty])}
     told = [
         f"{pictures.cameras[view].name} has no picture at frame {format_ranges(missing)}"
         for view, missing in list(lacking.items())[:MAX_LISTED]
     ]
     if len(lacking) > MAX_LISTED:
         told = [f"{len(lacking)} of {len(pictures.cameras)} cameras lack frames ({'; '.join(told)}; …)"]
-    return [f"{sentence}: treated as not visible" for sentence in told]
+    told = [f"{sentence}: treated as not visible" for sentence in told]
+    if empty:
+        told.append(f"no camera has a picture at frame {format_ranges(empty)}: the motion is interpolated there")
+    return told
 
 
 def format_ranges(numbers: list[int]) -> str:

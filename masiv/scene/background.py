@@ -40,25 +40,25 @@ _ROUNDS = 2
 
 @dataclass(frozen=True)
 class Noise:
-    """Covariances (3, 3) of a background's colour [grey levels²], far from and near the object, and how many pixels in
-    a neighbourhood share their noise: log-odds are divided by that."""
+    """Covariances (3, 3) of a background's colour [grey levels²], far from and near the object."""
 
     far: np.ndarray
     near: np.ndarray
-    correlated_pixels: float
 
 
 @dataclass(frozen=True)
 class BackgroundModel:
     """What the pictures of a recording have in common.
 
-    backgrounds: (H, W, 3) float32 for each view. shadow_cast (3,): share of light that a shadow takes from each channel
+    backgrounds: (H, W, 3) float32 for each view. correlated_pixels: how many pixels of a neighbourhood share their
+    noise; log-odds are divided by that. shadow_cast (3,): share of light that a shadow takes from each channel
     over its mean. log_colours (_BINS, _BINS, _BINS): log density of the object's colours. prior: log-odds of the
     object.
     """
 
     backgrounds: dict[int, np.ndarray]
     noise: Noise
+    correlated_pixels: float
     shadow_cast: np.ndarray
     log_colours: np.ndarray
     prior: float
@@ -73,7 +73,7 @@ class BackgroundModel:
         if coarse.any():
             near = cv2.dilate(coarse.astype(np.uint8), np.ones((_NEAR, _NEAR), np.uint8)) > 0
             log_odds = np.where(near, self._log_odds(picture, empty, self.noise.near, _CAST_SD_NEAR)[0], far)
-        evidence = (np.clip(log_odds, -_CLIP, _CLIP) + self.prior) / self.noise.correlated_pixels
+        evidence = (np.clip(log_odds, -_CLIP, _CLIP) + self.prior) / self.correlated_pixels
         probability = smooth_labels(evidence.astype(np.float32), picture)
         kept = cv2.dilate(largest_components(probability > 0.5).astype(np.uint8), np.ones((3, 3), np.uint8))
         sd = math.sqrt(np.trace(self.noise.near) / 3)
@@ -115,13 +115,18 @@ def learn_background(images: dict[int, np.ndarray], plates: dict[int, np.ndarray
     masks: dict[int, np.ndarray] = {}
     uniform = np.full((_BINS,) * 3, -3 * math.log(256.0), np.float32)
     log_colours = uniform
-    for _ in range(_ROUNDS + 1):
+    correlated = 1.0
+    for learnt in range(_ROUNDS + 1):
         backgrounds = {view: _background(plates[view], stack, taken[view]) for view, stack in pictures.items()}
         noise = _noise(pictures, backgrounds, taken, masks)
+        if learnt == 0:
+            correlated = _correlated_pixels(pictures, backgrounds, taken)
         cast = _shadow_cast(pictures, backgrounds)
         coverage = np.clip(np.mean([m.mean() for m in (masks or taken).values()]), 1e-3, 0.5)
-        model = BackgroundModel(backgrounds, noise, cast, log_colours, float(np.log(coverage / (1 - coverage))))
-        if len(masks) and _ == _ROUNDS:
+        model = BackgroundModel(
+            backgrounds, noise, correlated, cast, log_colours, float(np.log(coverage / (1 - coverage)))
+        )
+        if learnt == _ROUNDS:
             return model
         masks = {v: np.stack([model.mask(v, p) for p in stack]) for v, stack in pictures.items()}
         taken = {v: np.maximum(masks[v], [model.shadow(v, p) for p in stack]) > 0.1 for v, stack in pictures.items()}
@@ -208,11 +213,10 @@ def _noise(
     taken: dict[int, np.ndarray],
     masks: dict[int, np.ndarray],
 ) -> Noise:
-    far, near, shared = [], [], []
+    far, near = [], []
     for view, stack in pictures.items():
         residual = stack - backgrounds[view]
         free = ~taken[view]
-        shared.append(_shared_noise(residual, free))
         if view in masks:
             square = np.ones((_NEAR, _NEAR), np.uint8)
             zone = np.stack([cv2.dilate((m > 0.5).astype(np.uint8), square) > 0 for m in masks[view]])
@@ -224,7 +228,7 @@ def _noise(
     near_residual = np.concatenate(near) if near else np.empty((0, 3))
     enough = len(near_residual) > 1000
     near_covariance = _covariance(near_residual) if enough else 2 * far_covariance
-    return Noise(far_covariance, near_covariance, max(1.0, float(np.median(shared))))
+    return Noise(far_covariance, near_covariance)
 
 
 def _covariance(residual: np.ndarray) -> np.ndarray:
@@ -236,14 +240,17 @@ def _covariance(residual: np.ndarray) -> np.ndarray:
     return np.cov(residual[(np.abs(residual) < 4 * sd).all(axis=1)].T) + np.eye(3) / 12
 
 
-def _shared_noise(residual: np.ndarray, free: np.ndarray) -> float:
-    """Sum of the autocorrelation of the noise over lags up to two pixels: 1 for white noise."""
-    total = 0.0
-    base = _correlation(residual, free, 0, 0)
-    for dy in range(-2, 3):
-        for dx in range(-2, 3):
-            total += max(_correlation(residual, free, dy, dx) / base, 0.0)
-    return total
+def _correlated_pixels(
+    pictures: dict[int, np.ndarray], backgrounds: dict[int, np.ndarray], taken: dict[int, np.ndarray]
+) -> float:
+    """Sum of the autocorrelation of the noise over lags up to two pixels, 1 for white noise: of the median view."""
+    found = []
+    for view, stack in pictures.items():
+        residual, free = stack[:1] - backgrounds[view], ~taken[view][:1]
+        base = max(_correlation(residual, free, 0, 0), 1e-6)
+        lags = [(0, 1), (0, 2), *((dy, dx) for dy in (1, 2) for dx in range(-2, 3))]
+        found.append(1 + 2 * sum(max(_correlation(residual, free, *lag) / base, 0.0) for lag in lags))
+    return max(1.0, float(np.median(found)))
 
 
 def _correlation(residual: np.ndarray, free: np.ndarray, dy: int, dx: int) -> float:

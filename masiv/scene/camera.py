@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from masiv.scene.shutter import INSTANT, Shutter
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -13,6 +15,7 @@ class Camera:
 
     intrinsics: (3, 3) float64 [pixels], pixel centres at +0.5.
     world_to_camera: (4, 4) float64 [m], x_camera = R x_world + t.
+    shutter: when its pixels are exposed.
     """
 
     name: str
@@ -20,6 +23,7 @@ class Camera:
     height: int
     intrinsics: np.ndarray
     world_to_camera: np.ndarray
+    shutter: Shutter = INSTANT
 
     @property
     def centre(self) -> np.ndarray:
@@ -39,4 +43,4 @@ class Camera:
         intrinsics = self.intrinsics.copy()
         intrinsics[0, 2] -= x0
         intrinsics[1, 2] -= y0
-        return replace(self, width=width, height=height, intrinsics=intrinsics)
+        return replace(self, width=width, height=height, intrinsics=intrinsics, shutter=self.shutter.cropped(y0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,11 +10,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from masiv.errors import InputError
+from masiv.scene.camera import Camera
 from masiv.scene.depth import DepthNoise
 from masiv.scene.scene import Ground
+from masiv.scene.shutter import Shutter
 from masiv.strict import read_yaml, validated
 
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -42,8 +46,10 @@ class SceneDeclaration(BaseModel):
 
     fps: frames per second. up_axis: x, y, z, with a minus sign, or three numbers. gravity: three numbers [m/s²], or one
     magnitude along −up. ground: `none` or {normal, height}. density [kg/m³]. crop_box: two opposite corners [m, world];
-    masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given. depth_unit: of the steps
-    of depth pictures [m]. depth_noise: standard deviation of a depth z, constant [m] + quadratic [1/m] z².
+    masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given. exposure_time [s]: of a
+    row. readout_time [s]: of a rolling shutter, from the top row to the last one; negative if the last row is read
+    first. Both are one number, or a mapping from names of cameras; those that are not in it have 0. depth_unit [m]: of
+    the steps of depth pictures. depth_noise: standard deviation of a depth z, constant [m] + quadratic [1/m] z².
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -54,6 +60,8 @@ class SceneDeclaration(BaseModel):
     density: Annotated[FiniteFloat, Field(gt=0)] | None = None
     crop_box: tuple[Vector, Vector] | None = None
     fit_frames: Annotated[int, Field(ge=2)] | None = None
+    exposure_time: NotNegative | dict[str, NotNegative] = 0.0
+    readout_time: FiniteFloat | dict[str, FiniteFloat] = 0.0
     depth_unit: Annotated[FiniteFloat, Field(gt=0)] | None = None
     depth_noise: DepthNoiseDeclaration | None = None
 
@@ -97,6 +105,26 @@ class SceneDeclaration(BaseModel):
             raise InputError("scene.yaml: crop_box is flat: give two opposite corners")
         choice = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], dtype=bool)
         return np.where(choice, high, low)
+
+    def shutters(self, cameras: Sequence[Camera], fps: float) -> tuple[Shutter, ...]:
+        """The shutter of each camera.
+
+        Raises InputError for a camera that does not exist and for a time that is longer than a frame.
+        """
+        names = [camera.name for camera in cameras]
+        for key, times in (("exposure_time", self.exposure_time), ("readout_time", self.readout_time)):
+            for name, time in times.items() if isinstance(times, dict) else [(None, times)]:
+                if name is not None and name not in names:
+                    raise InputError(f"scene.yaml: {key} names camera {name!r}, the cameras are {', '.join(names)}")
+                if abs(time) > 1 / fps * (1 + 1e-6):
+                    raise InputError(f"scene.yaml: {key} is {time:g} s, a frame has {1 / fps:.6g} s: give seconds")
+
+        def of(times: float | dict[str, float], name: str) -> float:
+            return times.get(name, 0.0) if isinstance(times, dict) else times
+
+        return tuple(
+            Shutter.of_image(of(self.exposure_time, c.name), of(self.readout_time, c.name), c.height) for c in cameras
+        )
 
 
 def read_declaration(folder: Path) -> SceneDeclaration:

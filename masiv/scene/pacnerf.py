@@ -109,14 +109,9 @@ def _entries(folder: Path, listing: Path) -> list[_Entry]:
 
 def _frame_count(observed: list[_Entry], listing: Path) -> int:
     frames = sorted({e.frame for e in observed})
-    missing = sorted(set(range(frames[-1] + 1)) - set(frames))
-    if missing:
-        raise InputError(
-            f"{listing} has no picture of any view at frame {missing[0]}: frames must run from 0 without gaps"
-        )
     if len(frames) < 2:
         raise InputError(f"{listing} has one frame only: a motion needs two or more")
-    return len(frames)
+    return frames[-1] + 1
 
 
 def _fps(observed: list[_Entry], listing: Path) -> float:

@@ -27,11 +27,26 @@ def conventions(scene: Scene) -> dict[str, Any]:
         "density_kg_m3": float(scene.density),
         "mask_source": scene.mask_source,
         **depth,
+        **_shutters(scene),
+    }
+
+
+def _shutters(scene: Scene) -> dict[str, Any]:
+    """Exposure and readout times of the cameras [s], if there is one that is not zero."""
+    shutters = [camera.shutter for camera in scene.cameras]
+    if all(shutter.is_instant for shutter in shutters):
+        return {}
+    return {
+        "exposure_time_s": [shutter.exposure_time for shutter in shutters],
+        "readout_time_s": [shutter.readout_time for shutter in shutters],
     }
 
 
 def summarise(scene: Scene) -> dict[str, Any]:
-    """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem."""
+    """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem.
+
+    ``consistency_px`` of the cameras is not known here.
+    """
     if scene.load_cloud is not None:
         return _summarise_clouds(scene)
     problems = list(scene.problems)
@@ -69,6 +84,7 @@ def summarise(scene: Scene) -> dict[str, Any]:
                 "principal_point_px": [float(camera.intrinsics[0, 2]), float(camera.intrinsics[1, 2])],
                 "position_m": camera.centre.tolist(),
                 "frames": pictures.get(view, 0),
+                "consistency_px": None,
             }
             for view, camera in enumerate(scene.cameras)
         ],
@@ -125,12 +141,24 @@ def as_text(summary: dict[str, Any]) -> str:
             f"deviation {1e3 * noise['constant_m']:.3g} mm + {1e3 * noise['quadratic_1_m']:.3g} mm/m² z²"
         ]
     lines += [f"cameras  {summary['views']}"]
+    for key, name in (("exposure_time_s", "exposure"), ("readout_time_s", "readout ")):
+        if key in summary:
+            lines.append(f"{name} " + ", ".join(f"{1e3 * time:.3g}" for time in summary[key]) + " ms")
     lines += [
         f"  {index:2d} {camera['name']:10s} {camera['width_px']}×{camera['height_px']}"
         f"  focal {camera['focal_px'][0]:.1f} px  at {numbers(camera['position_m'])} m"
         + ("" if camera["frames"] == summary["frames"] else f"  {camera['frames']} of {summary['frames']} frames")
         for index, camera in enumerate(summary["cameras"])
     ]
+    lines += _agreement(summary["cameras"])
     lines += ["problems " + ("none" if not summary["problems"] else "")]
     lines += [f"  - {problem}" for problem in summary["problems"]]
     return "\n".join([*lines, f"picture  {summary['picture']}"])
+
+
+def _agreement(cameras: list[dict[str, Any]]) -> list[str]:
+    """One line: the error of each camera's silhouettes against those of the others."""
+    known = [
+        f"{index}: {c['consistency_px']:.2f}" for index, c in enumerate(cameras) if c["consistency_px"] is not None
+    ]
+    return [f"agreement of the silhouettes with those of the other cameras [px]  {', '.join(known)}"] if known else []

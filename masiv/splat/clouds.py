@@ -150,6 +150,7 @@ def initial_from_clouds(scene: Scene, count: int) -> InitialGaussians:
         half_extent=float((high - low).max() / 2 + spacing),
         base_motion=centroids - centroids[0],
         hulls=(),
+        frames=(),
     )
 
 

@@ -10,9 +10,9 @@ class CalibrationConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    rotation_deg: float = Field(0.5, gt=0, description="prior standard deviation of a camera's rotation [degrees]")
+    rotation_deg: float = Field(0.3, gt=0, description="prior standard deviation of a camera's rotation [degrees]")
     translation_fraction: float = Field(
-        0.005, gt=0, description="of a camera's place, as a fraction of its distance to the object"
+        0.003, gt=0, description="of a camera's place, as a fraction of its distance to the object"
     )
     focal_fraction: float = Field(0.005, gt=0, description="of a camera's focal length, as a fraction")
     time_frames: float = Field(0.5, gt=0, description="of a camera's clock [frames]")

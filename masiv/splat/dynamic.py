@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from masiv.scene.calibration import Calibration
@@ -30,6 +31,12 @@ class DynamicGaussians:
             displacement, log_scale = self.deformation(canonical.means, time)
             scales = canonical.scales * log_scale.exp()
         return Gaussians(canonical.means + displacement, scales, canonical.opacities, canonical.colours)
+
+    def base_positions(self, times: np.ndarray) -> np.ndarray:
+        """Where the base motion takes the centre of the Gaussians at ``times`` (K,) [s], shape (K, 3) [m]."""
+        with torch.no_grad():
+            moved = self.deformation.base_displacements(torch.as_tensor(times, dtype=torch.float32))
+        return (self.canonical.means.mean(dim=0) + moved).double().numpy()
 
     def save(self, folder: Path) -> None:
         """Write gaussians.ply, deformation.safetensors and, if cameras were refined, calibration.json to ``folder``."""

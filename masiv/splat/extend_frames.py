@@ -16,7 +16,9 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.hull.carve import visual_hull
 from masiv.hull.shadow_volume import remove_shadow_volume
+from masiv.hull.velocity import with_velocities
 from masiv.progress import Progress, silent
+from masiv.scene.gaps import interpolated
 from masiv.scene.scene import Scene
 from masiv.splat.clouds import centroid, cloud_objective
 from masiv.splat.config import ReconstructConfig
@@ -116,23 +118,40 @@ class _ExtensionFit:
             self.optimiser.load_state_dict(state["optimiser"])
 
     def _observe(self, scene: Scene, scale: float, progress: Progress) -> torch.Tensor:
-        """Set the objective and ``images`` of the new frames; returns centroids (K, 3) [m] from the last known frame
-        on."""
-        config, new, frames = self.config, range(self.known, self.count), range(self.known - 1, self.count)
+        """Set the objective and the ``images`` of the ``observed`` new frames.
+
+        Returns centroids (K, 3) [m] from the last known frame on, interpolated at frames without a picture.
+        """
+        config = self.config
+        self.observed = [frame for frame in scene.observed_frames if frame >= self.known]
+        if not self.observed:
+            raise InputError(f"{scene.path} has no picture of a frame from {self.known} on")
+        last = max(frame for frame in scene.observed_frames if frame < self.known)
+        frames = [last, *self.observed]
         if scene.load_cloud is not None:
-            self.objective = cloud_objective(scene, config, new, config.gaussians, scale, self.half_extent)
-            self.images = self.objective.images
-            found = [centroid(scene.cloud(frame).points) for frame in frames]
-            return torch.tensor(np.stack(found), dtype=torch.float32)
-        self.images = dict(zip(new, observed_images(scene, config, new), strict=True))
-        progress("extend frames", 0, self.iterations, "carving hulls")
-        first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
-        hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
-        losses = {frame: HullLoss(hull) for frame, hull in zip(new, hulls[1:], strict=True)}
-        self.objective = Objective(
-            config, scale, self.half_extent, scene.fps, scene.ground, losses, self.images, scene.view_time_offsets
-        )
-        return torch.tensor(np.stack([h.points.mean(axis=0) for h in hulls]), dtype=torch.float32)
+            self.objective = cloud_objective(scene, config, self.observed, config.gaussians, scale, self.half_extent)
+            self.images = {frame: self.objective.images[frame] for frame in self.observed}
+            centroids = np.stack([centroid(scene.cloud(frame).points) for frame in frames])
+        else:
+            self.images = dict(zip(self.observed, observed_images(scene, config, self.observed), strict=True))
+            progress("extend frames", 0, self.iterations, "carving hulls")
+            scene = with_velocities(scene)
+            first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
+            hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
+            losses = {frame: HullLoss(hull) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
+            self.objective = Objective(
+                config,
+                scale,
+                self.half_extent,
+                scene.fps,
+                scene.ground,
+                losses,
+                self.images,
+                scene.view_time_offsets,
+            )
+            centroids = np.stack([h.points.mean(axis=0) for h in hulls])
+        centroids = interpolated([frame - last for frame in frames], centroids, self.count - last)
+        return torch.tensor(centroids[self.known - 1 - last :], dtype=torch.float32)
 
     def _begin(self, known: DeformationNetwork, centroids: torch.Tensor, *, pretrain: bool) -> None:
         """A network of all frames. ``centroids`` of the hulls, from the last known frame on, extend the base motion."""
@@ -228,10 +247,11 @@ class _ExtensionFit:
 
     def _choose_images(self, rng: np.random.Generator) -> list[tuple[int, int]]:
         """(frame, index of its image). One shows the newest frame while frames are added, others a random new one."""
-        frames = rng.integers(self.known, self.frames, size=self.config.batch_size)
+        in_fit = [frame for frame in self.observed if frame < self.frames] or self.observed[:1]
+        chosen = rng.integers(len(in_fit), size=self.config.batch_size)
         if self.annealing == 0:
-            frames[0] = self.frames - 1
-        return [(int(f), int(rng.integers(len(self.images[int(f)])))) for f in frames]
+            chosen[0] = len(in_fit) - 1
+        return [(in_fit[k], int(rng.integers(len(self.images[in_fit[k]])))) for k in chosen]
 
 
 def _parameters(gaussians: Gaussians) -> dict[str, torch.Tensor]:

@@ -9,6 +9,8 @@ import numpy as np
 from masiv.errors import MasivError
 from masiv.hull.carve import VisualHull, visual_hull
 from masiv.hull.shadow_volume import remove_shadow_volume
+from masiv.hull.velocity import with_velocities
+from masiv.scene.gaps import interpolated
 from masiv.scene.scene import Scene
 
 
@@ -17,7 +19,7 @@ class InitialGaussians:
     """means (N, 3) [m]; scale [m]: standard deviation of all; colours (N, 3) in [0, 1].
 
     centre (3,) and half_extent [m]: of the first hull. base_motion (T, 3) [m]: centroids of the hulls relative to frame
-    0. hulls: of the T frames, without shadow volume.
+    0, interpolated at frames without a picture. hulls: of the other ``frames``, without shadow volume.
     """
 
     means: np.ndarray
@@ -27,6 +29,7 @@ class InitialGaussians:
     half_extent: float
     base_motion: np.ndarray
     hulls: tuple[VisualHull, ...]
+    frames: tuple[int, ...]
 
 
 def initial_gaussians(scene: Scene, count: int, resolution: int, rng: np.random.Generator) -> InitialGaussians:
@@ -34,10 +37,12 @@ def initial_gaussians(scene: Scene, count: int, resolution: int, rng: np.random.
 
     Raises MasivError if a hull is empty or the first one is a single voxel.
     """
+    scene = with_velocities(scene)
     hull = visual_hull(scene, 0, resolution=resolution)
-    later = (visual_hull(scene, frame, resolution=resolution) for frame in range(1, scene.frame_count))
-    hulls = (hull, *(remove_shadow_volume(scene, frame, h, hull.volume) for frame, h in enumerate(later, start=1)))
-    centroids = np.stack([h.points.mean(axis=0) for h in hulls])
+    frames = scene.observed_frames
+    later = ((frame, visual_hull(scene, frame, resolution=resolution)) for frame in frames[1:])
+    hulls = (hull, *(remove_shadow_volume(scene, frame, h, hull.volume) for frame, h in later))
+    centroids = interpolated(frames, np.stack([h.points.mean(axis=0) for h in hulls]), scene.frame_count)
     shell = hull.points[hull.surface]
     if len(shell) < 2:
         raise MasivError(
@@ -55,6 +60,7 @@ def initial_gaussians(scene: Scene, count: int, resolution: int, rng: np.random.
         half_extent=float((high - low).max() / 2 + hull.spacing),
         base_motion=centroids - centroids[0],
         hulls=hulls,
+        frames=frames,
     )
 
 

@@ -16,6 +16,7 @@ from masiv.splat.image_formation import Corrections, ImageFormation
 from masiv.splat.losses import Pairs, depth_distance, ssim, strain
 from masiv.splat.observed_image import ObservedImage
 from masiv.splat.rasteriser import render
+from masiv.splat.shutter import expose, velocities
 
 PARAMETER_NAMES = ("means", "log_scales", "opacity_logits", "colour_logits")
 """The parameters of the Gaussians."""
@@ -153,7 +154,14 @@ class Objective:
             positions = means + displacements[k]
             if corrected is not None:
                 positions = corrected.positions(observed.view, positions)
-            drawn = render(observed.camera, positions, scales, opacities, colours, background)
+            if observed.camera.shutter.is_instant:
+                drawn = render(observed.camera, positions, scales, opacities, colours, background)
+            else:
+                velocity = velocities(network, means.detach(), float(moments.times[k].detach()), observed.camera)
+                if corrected is not None:  # the corrections are an affine map
+                    ahead = corrected.positions(observed.view, means + displacements[k] + velocity)
+                    velocity = ahead - positions
+                drawn = expose(observed.camera, positions, velocity, scales, opacities, colours, background)
             rgb = drawn.rgb
             if corrected is not None:
                 rgb = corrected.rgb(observed.view, frame, rgb, drawn.alpha, background)

@@ -46,15 +46,18 @@ class ObservedImage:
 
 
 def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[list[ObservedImage]]:
-    """The images of each of ``frames`` that show the object. Raises MasivError for a frame without any."""
-    found = []
+    """The images of each of ``frames`` that show the object; none for a frame without pictures.
+
+    Raises MasivError if there are pictures of a frame, but none shows the object.
+    """
+    found, observed = [], set(scene.observed_frames)
     for frame in frames:
         of_frame = [
             observed_image(scene, view, frame, crop_side=config.crop_side, crop_padding=config.crop_padding)
             for view in scene.views
         ]
         found.append([image for image in of_frame if image is not None])
-        if not found[-1]:
+        if not found[-1] and frame in observed:
             raise MasivError(f"frame {frame} of {scene.path}: no view shows the object; check its masks")
     return found
 
@@ -124,4 +127,10 @@ def _reduced_camera(camera: Camera, factor: int) -> Camera:
     """The camera of an image averaged over factor x factor blocks. All of K scales, since pixel centres are at +0.5."""
     intrinsics = camera.intrinsics.copy()
     intrinsics[:2] /= factor
-    return replace(camera, width=camera.width // factor, height=camera.height // factor, intrinsics=intrinsics)
+    return replace(
+        camera,
+        width=camera.width // factor,
+        height=camera.height // factor,
+        intrinsics=intrinsics,
+        shutter=camera.shutter.reduced(factor),
+    )

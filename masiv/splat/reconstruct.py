@@ -14,6 +14,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.progress import Progress
 from masiv.scene.calibration import Calibration
+from masiv.scene.gaps import interpolated
 from masiv.scene.scene import Scene
 from masiv.splat.clouds import cloud_objective, for_clouds, initial_from_clouds
 from masiv.splat.config import ReconstructConfig
@@ -75,6 +76,8 @@ class _Fit:
         self.identity = repr(
             (config.model_dump(exclude={"processes"}), seed, str(scene.path), scene.frame_count, scene.views)
         )
+        shutters = [scene.cameras[view].shutter for view in scene.views]
+        self.identity += "" if all(s.is_instant for s in shutters) else repr(shutters)
         initial = self._observe(progress)
         self.half_extent = initial.half_extent
         self.formation = self._image_formation(initial) if self.config.refine_calibration else None
@@ -101,7 +104,7 @@ class _Fit:
         initial = initial_gaussians(
             scene, config.gaussians, config.hull_resolution, np.random.default_rng((self.seed, 0))
         )
-        hulls = tuple(HullLoss(hull) for hull in initial.hulls)
+        hulls = {frame: HullLoss(hull) for frame, hull in zip(initial.frames, initial.hulls, strict=True)}
         self.objective = Objective(
             config,
             initial.scale,
@@ -168,10 +171,9 @@ class _Fit:
     def _image_formation(self, initial: InitialGaussians) -> ImageFormation:
         """Cameras and exposures that are not corrected yet. Steps are scaled by what the hulls show of the object."""
         scene = self.scene
-        velocities = np.gradient(initial.base_motion, 1 / scene.fps, axis=0)
+        velocities = np.gradient(initial.base_motion, 1 / scene.fps, axis=0)[list(initial.frames)]
         surfaces = [hull.points[hull.surface] for hull in initial.hulls]
         surfaces = [points[:: max(1, len(points) // HULL_POINTS)] for points in surfaces]
-        shown = [float(image.mask.sum()) for of_frame in self.images for image in of_frame]
         return ImageFormation(
             [scene.cameras[view] for view in scene.views],
             scene.frame_count,
@@ -179,7 +181,6 @@ class _Fit:
             self.config.calibration,
             np.concatenate(surfaces),
             np.repeat(velocities, [len(points) for points in surfaces], axis=0),
-            float(np.mean(shown)),
         )
 
     @property
@@ -264,6 +265,7 @@ class _Fit:
                 "reconstruct.means_rate"
             )
         self.optimiser.step()
+        self._interpolate_base_motion()
         frames = self.frames
         self.iteration += 1
         if self.frames > frames:
@@ -272,6 +274,14 @@ class _Fit:
         if self.iteration in self._pruning_steps():
             self._prune()
         return value
+
+    def _interpolate_base_motion(self) -> None:
+        """No image moves the knots of frames without a picture: they follow the spline through the others."""
+        frames, count = self.scene.observed_frames, self.scene.frame_count
+        if len(frames) < count:
+            knots = self.network.base_motion.detach()
+            filled = interpolated(frames, knots[list(frames)].double().numpy(), count)
+            knots.copy_(torch.from_numpy(filled))
 
     def _compute_gradients(self, parts: tuple[Part, ...]) -> float:
         """Set the gradient of each parameter to the sum over ``parts``, in their order; returns the loss."""
@@ -289,10 +299,11 @@ class _Fit:
 
     def _choose_images(self, rng: np.random.Generator) -> list[tuple[int, int]]:
         """(frame, index of its image). One shows the newest frame while frames are added, the others random frames."""
-        frames = rng.integers(self.frames, size=self.config.batch_size)
+        observed = [frame for frame in self.scene.observed_frames if frame < self.frames]
+        chosen = rng.integers(len(observed), size=self.config.batch_size)
         if self.frames < self.scene.frame_count:
-            frames[0] = self.frames - 1
-        return [(int(f), int(rng.integers(len(self.images[f])))) for f in frames]
+            chosen[0] = len(observed) - 1
+        return [(observed[k], int(rng.integers(len(self.images[observed[k]])))) for k in chosen]
 
     def _pruning_steps(self) -> tuple[int, ...]:
         """Iterations: at the end of frame 0 alone, and twice while all frames are in."""

@@ -1,0 +1,1 @@
+"""How well the calibration of the cameras agrees with the silhouettes."""
