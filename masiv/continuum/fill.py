@@ -13,9 +13,12 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from masiv.continuum.cloud_volume import cloud_volume
 from masiv.continuum.config import TrajectoryConfig
+from masiv.continuum.density_field import DensityField, even_points
 from masiv.errors import MasivError
 from masiv.hull.carve import visual_hull
+from masiv.hull.depth import depth_views
 from masiv.hull.shadow_volume import remove_shadow_volume
 from masiv.hull.silhouette import sample_bilinear, silhouettes
 from masiv.scene.camera import Camera
@@ -37,25 +40,6 @@ class FilledVolume:
     points: np.ndarray
     spacing: float
     volume: float
-
-
-@dataclass(frozen=True)
-class DensityField:
-    """Occupancy (I, J, K) in [0, 1] at lower + spacing (i, j, k) [m]; the solid is {density > 0.5}."""
-
-    density: np.ndarray
-    lower: np.ndarray
-    spacing: float
-
-    @property
-    def volume(self) -> float:
-        """Volume of the solid [m³]."""
-        return float((self.density > 0.5).sum()) * self.spacing**3
-
-    def inside(self, points: np.ndarray) -> np.ndarray:
-        """Which points (N, 3) [m] are in the solid, (N,) bool."""
-        coordinates = ((points - self.lower) / self.spacing).T
-        return ndimage.map_coordinates(self.density, coordinates, order=1, mode="constant", cval=0.0) > 0.5
 
 
 def fill_volume(
@@ -84,8 +68,18 @@ def fill_volume(
     return FilledVolume(points, spacing, len(points) * spacing**3)
 
 
+def hull_volume(scene: Scene, config: TrajectoryConfig) -> float | None:
+    """Volume [m³] of the object's hull at frame 0; None for point clouds, which have no shadow volume."""
+    return None if scene.load_cloud is not None else visual_hull(scene, 0, resolution=config.fill_resolution).volume
+
+
 def fill_later_frame(
-    scene: Scene, dynamic: DynamicGaussians, frame: int, config: TrajectoryConfig, start: FilledVolume, volume: float
+    scene: Scene,
+    dynamic: DynamicGaussians,
+    frame: int,
+    config: TrajectoryConfig,
+    start: FilledVolume,
+    volume: float | None,
 ) -> FilledVolume | None:
     """``fill_volume``, a little finer than ``start`` fills frame 0; None for a frame without a picture."""
     if frame not in scene.observed_frames:
@@ -103,8 +97,14 @@ def density_field(
 ) -> DensityField:
     """Carve ``frame`` by its silhouettes and, with ``dynamic``, by the depth of the rendered surface; smooth it.
 
+    Of a point cloud, the solid that it encloses or fills.
+
     volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``.
     """
+    if scene.load_cloud is not None:
+        return cloud_volume(
+            scene.cloud(frame), config.fill_resolution, scene.ground, f"the cloud of frame {frame} of {scene.path}"
+        )
     hull = visual_hull(scene, frame, resolution=config.fill_resolution)
     if volume is not None:
         hull = remove_shadow_volume(scene, frame, hull, volume)
@@ -114,10 +114,13 @@ def density_field(
     index = np.rint((hull.points - lower) / spacing).astype(int)
     density = np.zeros(index.max(axis=0) + 1 + margin, np.float32)
     outside = np.full(len(hull.points), -np.inf)
-    for view in silhouettes(scene, frame):
+    views = silhouettes(scene, frame)
+    for view in views:
         distance, _, visible = view.distances(hull.points)
         outside = np.maximum(outside, np.where(visible, distance, -np.inf))
-    # A voxel at the edge of a silhouette has the density of the part that is inside.
+    for depth in depth_views(scene, frame, views):
+        outside = np.maximum(outside, np.maximum(depth.outside(hull.points), depth.behind(hull.points)))
+    # A voxel at the edge of a silhouette, or at a measured surface, has the density of the part that is inside.
     filled = np.clip(0.5 - outside / spacing, 0.0, 1.0)
     if dynamic is not None:
         filled[in_front_of_surface(scene, dynamic, frame, hull.points, config.depth_tolerance * spacing)] = 0.0
@@ -143,21 +146,6 @@ def in_front_of_surface(
         shown = (along > 0) & (pixels >= 0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
         votes[shown] += along[shown] < sample_bilinear(depth, pixels[shown]) - tolerance
     return votes >= 2
-
-
-def even_points(field: DensityField, spacing: float) -> np.ndarray:
-    """Points (M, 3) [m] of a body-centred cubic lattice inside ``field``, one for each spacing³ of volume.
-
-    For a given number of points this lattice leaves smaller gaps than a simple cubic one.
-    """
-    cell = spacing * 2 ** (1 / 3)
-    solid = np.argwhere(field.density > 0.5)
-    low = field.lower + (solid.min(axis=0) - 1) * field.spacing
-    high = field.lower + (solid.max(axis=0) + 1) * field.spacing
-    counts = np.ceil((high - low) / cell).astype(int) + 1
-    corners = low + cell * np.stack(np.meshgrid(*[np.arange(c) for c in counts], indexing="ij"), -1).reshape(-1, 3)
-    lattice = np.concatenate([corners + 0.25 * cell, corners + 0.75 * cell])
-    return lattice[field.inside(lattice)]
 
 
 def _main_pieces(solid: np.ndarray) -> np.ndarray:

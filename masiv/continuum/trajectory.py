@@ -16,11 +16,11 @@ import torch
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.consistency import consistent_particles
-from masiv.continuum.fill import FilledVolume, density_field, even_points, fill_later_frame
+from masiv.continuum.density_field import even_points
+from masiv.continuum.fill import FilledVolume, density_field, fill_later_frame, hull_volume
 from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
 from masiv.files import write_npz
-from masiv.hull.carve import visual_hull
 from masiv.hull.velocity import with_velocities
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
@@ -96,7 +96,7 @@ def estimate_trajectory(
     checkpoint = checkpoint or Checkpoint(None)
     scene = with_velocities(scene, dynamic.base_positions(scene.times))
     start = fill_first_frame(scene, dynamic, config)
-    hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
+    hull = hull_volume(scene, config)
     volumes = []
     for frame in range(1, scene.frame_count):
         progress("fill", frame, scene.frame_count - 1)

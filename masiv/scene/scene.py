@@ -12,6 +12,8 @@ import numpy as np
 
 from masiv.errors import InputError
 from masiv.scene.camera import Camera
+from masiv.scene.cloud import Cloud
+from masiv.scene.depth import DepthNoise
 from masiv.scene.frame_cache import Frame, FrameCache
 
 
@@ -40,6 +42,8 @@ class Scene:
     for the user. velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for
     silhouettes of views that show other times than the frame's. time_offsets [s]: of the cameras' clocks, empty if all
     are exact. A picture was taken at frame / fps + offset. missing: (view, frame) of which there is no picture.
+    depth_noise: None if the pictures have no depth. ``load_cloud(frame)``: for a recording of point clouds, which has
+    no cameras; ``cloud(frame)`` also checks that this scene contains it.
     """
 
     path: Path
@@ -59,6 +63,8 @@ class Scene:
     correct_masks: Callable[[Scene, int], Mapping[int, Frame]] | None = None
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
+    depth_noise: DepthNoise | None = None
+    load_cloud: Callable[[int], Cloud] | None = None
     velocities: np.ndarray | None = None
     time_offsets: tuple[float, ...] = ()
     missing: frozenset[tuple[int, int]] = frozenset()
@@ -122,6 +128,12 @@ class Scene:
         cache = FrameCache(corrected)
         return cache
 
+    def cloud(self, frame: int) -> Cloud:
+        """The point cloud of ``frame``. Raises InputError if the frame is held out, or the recording has no clouds."""
+        if self.load_cloud is None or not 0 <= frame < self.frame_count:
+            raise InputError(f"frame {frame} of {self.path} has no point cloud that this stage may see")
+        return self.load_cloud(frame)
+
     def restricted(self, fit_frames: int | None = None, holdout_cameras: tuple[int, ...] = ()) -> Scene:
         """The first ``fit_frames`` frames (None: all) without ``holdout_cameras``: the training data of a fit.
 
@@ -132,10 +144,12 @@ class Scene:
             raise InputError(
                 f"--fit-frames {count}: the scene has {self.frame_count} frames, give 2 to {self.frame_count}"
             )
+        if holdout_cameras and not self.cameras:
+            raise InputError(f"--holdout-camera {holdout_cameras[0]}: {self.path} has point clouds and no cameras")
         for view in holdout_cameras:
             if not 0 <= view < len(self.cameras):
                 raise InputError(f"--holdout-camera {view}: the scene has cameras 0 to {len(self.cameras) - 1}")
         hidden = tuple(sorted({*self.hidden_views, *holdout_cameras}))
-        if len(hidden) >= len(self.cameras):
+        if self.cameras and len(hidden) >= len(self.cameras):
             raise InputError("--holdout-camera leaves no camera to train on")
         return replace(self, frame_count=count, hidden_views=hidden)

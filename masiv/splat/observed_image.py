@@ -18,11 +18,25 @@ from masiv.splat.config import ReconstructConfig
 
 
 @dataclass(frozen=True)
+class ObservedDepth:
+    """Depth of the object along the optical axis; float32 tensors.
+
+    values (H, W) [m], and their standard deviation ``noise`` (H, W) [m]; known (H, W): 1 where the whole pixel is on
+    the object and measured, else 0.
+    """
+
+    values: torch.Tensor
+    noise: torch.Tensor
+    known: torch.Tensor
+
+
+@dataclass(frozen=True)
 class ObservedImage:
     """One image of the object; float32 tensors.
 
     view: index of the camera among those that are fitted. camera: of the crop. colour (H, W, 3) in [0, 1], multiplied
-    by the mask. mask (H, W) in [0, 1]. valid (H, W): the fraction of a pixel that no occluder hides.
+    by the mask. mask (H, W) in [0, 1]. valid (H, W): the fraction of a pixel that no occluder hides. depth:
+    measured depth of the object, if the recording has any.
     """
 
     view: int
@@ -30,6 +44,7 @@ class ObservedImage:
     colour: torch.Tensor
     mask: torch.Tensor
     valid: torch.Tensor
+    depth: ObservedDepth | None = None
 
 
 class StoredImages(Sequence[ObservedImage]):
@@ -100,7 +115,20 @@ def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_
         torch.from_numpy(_average(colour, factor) / divisor[..., None]),
         torch.from_numpy(_average(mask, factor) / divisor),
         torch.from_numpy(visible),
+        None if picture.depth is None else _observed_depth(scene, picture.depth[window], mask, factor),
     )
+
+
+def _observed_depth(scene: Scene, depth: np.ndarray, mask: np.ndarray, factor: int) -> ObservedDepth | None:
+    """Depth (H, W) [m] of the crop, averaged down; None if no pixel is on the object and measured as a whole."""
+    known = _average(((depth > 0) & (mask > 0.99)).astype(np.float32), factor) > 1 - 1e-6
+    if scene.depth_noise is None or not known.any():
+        return None
+    values = np.where(known, _average(depth, factor), np.float32(0))
+    noise = scene.depth_noise.std(values)
+    # Not divided by the factor: errors of neighbouring pixels of a depth camera are correlated.
+    arrays = values, noise.astype(np.float32), known.astype(np.float32)
+    return ObservedDepth(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 
 
 def _span(indices: np.ndarray, padding: int, factor: int, limit: int) -> tuple[int, int]:
