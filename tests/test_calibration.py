@@ -187,7 +187,14 @@ def test_the_gradient_of_the_image_loss_is_that_of_finite_differences():
     with torch.no_grad():
         made.pose.mul_(0.3)
     pairs = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long)
-    part = Part(((0, 0, np.full(3, 0.2)), (1, 0, np.full(3, 0.9))), 2, (), 2, None, scale_term=False)
+    part = Part(
+        ((0, objective.images[0][0], np.full(3, 0.2)), (1, objective.images[1][0], np.full(3, 0.9))),
+        2,
+        (),
+        2,
+        None,
+        scale_term=False,
+    )
 
     def loss():
         torch.set_default_dtype(torch.float64)
