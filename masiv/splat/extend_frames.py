@@ -25,7 +25,7 @@ from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.extrapolate import extrapolate_motion
 from masiv.splat.gaussians import Gaussians
-from masiv.splat.hull_loss import HullLoss
+from masiv.splat.hull_loss import HullLoss, TreeCache
 from masiv.splat.losses import neighbour_pairs
 from masiv.splat.objective import Objective
 from masiv.splat.observed_image import observed_images
@@ -113,7 +113,8 @@ class _ExtensionFit:
         self.gaussians = _parameters(dynamic.canonical)
         self.pairs = neighbour_pairs(means.double().numpy(), config.neighbours)
         self.half_extent = known.settings["half_extent"]
-        hull_losses = {frame: HullLoss(hull) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
+        cache = TreeCache()
+        hull_losses = {frame: HullLoss(hull, cache) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
         scale = float(dynamic.canonical.scales.mean())
         self.objective = Objective(
             config,
