@@ -12,7 +12,7 @@ transform of the world (7 parameters, which no picture can determine) that fits 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,22 +32,34 @@ def true_particles(folder: Path, per_frame: int = 300) -> np.ndarray:
     return np.concatenate([points[rng.permutation(len(points))[:per_frame]] for points in every])
 
 
+def fitted_similarity(
+    exact: Sequence[Camera], estimated: Sequence[Camera], points: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The similarity transform of points (P, 3) [m] for which ``estimated`` see best what ``exact`` see."""
+    true = [camera.project(points)[0] for camera in exact]
+    centre = points.mean(axis=0)
+
+    def moved(p: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return centre + p[3:6] + np.exp(p[6]) * Rotation.from_rotvec(p[:3]).apply(at - centre)
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        at = moved(p, points)
+        return np.stack([camera.project(at)[0] - t for camera, t in zip(estimated, true, strict=True)]).ravel()
+
+    found = least_squares(residuals, np.zeros(7), method="lm").x
+    return lambda at: moved(found, at)
+
+
 def reprojection_errors(
     exact: Sequence[Camera], estimated: Sequence[Camera], points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Root mean square displacement [px] (V,) of each camera, as it is and after the best similarity transform."""
-    true = [camera.project(points)[0] for camera in exact]
-    centre = points.mean(axis=0)
-
-    def residuals(p: np.ndarray) -> np.ndarray:
-        moved = centre + p[3:6] + np.exp(p[6]) * Rotation.from_rotvec(p[:3]).apply(points - centre)
-        return np.stack([camera.project(moved)[0] - t for camera, t in zip(estimated, true, strict=True)])
-
-    def rms(r: np.ndarray) -> np.ndarray:
-        return np.sqrt((r**2).sum(axis=2).mean(axis=1))
-
-    fitted = least_squares(lambda p: residuals(p).ravel(), np.zeros(7), method="lm").x
-    return rms(residuals(np.zeros(7))), rms(residuals(fitted))
+    aligned = fitted_similarity(exact, estimated, points)(points)
+    rows = []
+    for at in (points, aligned):
+        off = [e.project(at)[0] - c.project(points)[0] for e, c in zip(estimated, exact, strict=True)]
+        rows.append(np.sqrt((np.stack(off) ** 2).sum(axis=2).mean(axis=1)))
+    return rows[0], rows[1]
 
 
 def main() -> None:

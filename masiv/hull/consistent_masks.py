@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from masiv.hull.carve import occupancy_grid
-from masiv.hull.silhouette import Silhouette, silhouette
+from masiv.hull.silhouette import Silhouette, silhouettes
 from masiv.hull.votes import FEWEST_VIEWS, Votes, consensus, vote
 from masiv.scene.frame_cache import Frame
 from masiv.scene.scene import Scene
@@ -40,12 +40,13 @@ def consistent_masks(scene: Scene, frame: int) -> dict[int, Frame]:
     With fewer than five views the pictures are returned as they are.
     """
     pictures = {view: scene.frame(view, frame) for view in scene.views}
+    given = {s.view: s for s in silhouettes(scene, frame)}
     shown = {view: p for view, p in pictures.items() if p.valid.any() and (p.mask > 0.5).any()}
     if len(shown) < FEWEST_VIEWS:
         return pictures
     masks = {view: p.mask for view, p in shown.items()}
     for _ in range(_ROUNDS):
-        views = tuple(silhouette(v, scene.cameras[v], mask, shown[v].valid) for v, mask in masks.items())
+        views = tuple(given[view].with_mask(mask) for view, mask in masks.items())
         grid = occupancy_grid(views, scene, frame, RESOLUTION)
         votes = vote(views, grid.points, 0.5 * grid.spacing, scene.ground, grid.spacing)
         hull = consensus(views, votes)

@@ -28,6 +28,10 @@ class Silhouette:
     velocity: np.ndarray | None = None
     time_offset: float = 0.0
 
+    def with_mask(self, mask: np.ndarray) -> Silhouette:
+        """This view with another ``mask`` (H, W) in [0, 1]."""
+        return replace(self, distance=signed_distance(mask), confidence=_confidence(mask))
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As ``Camera.project``, of points that are at ``points`` at the frame's time and move with ``velocity``."""
         pixels, depth = self.camera.project(points)
@@ -71,13 +75,13 @@ def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
 
 
 def silhouette(view: int, camera: Camera, mask: np.ndarray, valid: np.ndarray) -> Silhouette:
-    """The silhouette of ``mask`` (H, W) in [0, 1].
+    """The silhouette of ``mask`` (H, W) in [0, 1]."""
+    return Silhouette(view, camera, signed_distance(mask), _confidence(mask), valid)
 
-    A pixel at the outline shows both object and background. Its mask is near one half, but the outline is certain if it
-    is next to pixels that are.
-    """
-    confidence = cv2.dilate(np.abs(2 * mask - 1).astype(np.float32), np.ones((3, 3), np.uint8))
-    return Silhouette(view, camera, signed_distance(mask), confidence, valid)
+
+def _confidence(mask: np.ndarray) -> np.ndarray:
+    """Of each pixel, (H, W) float32. An outline is certain if it is next to pixels that are, though it is half full."""
+    return cv2.dilate(np.abs(2 * mask - 1).astype(np.float32), np.ones((3, 3), np.uint8))
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:

@@ -19,10 +19,12 @@ from masiv.splat.config import CalibrationConfig
 POSE = 8
 """Corrections of a camera: rotation vector (3) [rad], translation (3) [m], log focal factor, time offset [s]."""
 REGISTRATION_NOISE_PX = 0.1
-"""Error to which pictures register a camera. It scales the optimiser's steps alone: along a direction in which one
-prior standard deviation moves the picture by less than this, steps are fractions of that standard deviation."""
-CORRELATED_PIXELS = 9
-"""Pixels whose errors are not independent: a Gaussian's footprint is about 3 x 3."""
+"""Error to which pictures register a camera: what the gauge takes for it when it weighs pixels and prior."""
+INDEPENDENT_ERRORS = 50
+"""Errors of a picture's pixels that are independent of each other. What is left after a fit are errors of the model
+(shape, shading, motion), which are alike over patches of about a seventh of the object's width, and in all frames of a
+camera. With all pixels counted as independent the prior had no weight, and cameras circled the object by a degree to
+explain shading. The number is an estimate: it was not calibrated."""
 EXPOSURE_STEP = 0.02
 """Unit of the exposure's parameters: a change of 2 % of white is as visible as about a pixel of displacement."""
 
@@ -52,16 +54,15 @@ class ImageFormation(torch.nn.Module):
         config: CalibrationConfig,
         points: np.ndarray,
         velocities: np.ndarray,
-        pixels: float,
     ) -> None:
-        """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs. pixels: mean number that an
-        image shows of the object."""
+        """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs."""
         super().__init__()
         self.fps, self.config, self.points = fps, config, points
         self.pivot = points.mean(axis=0)
         # The image loss is a mean absolute error. Of independent Laplacian errors of mean b, -log p is their sum over
         # b: the loss times their number over b. So the prior counts b over that number.
-        self.prior_weight = CORRELATED_PIXELS / (pixels * len(cameras) * frame_count)
+        self.prior_weight = 1 / (INDEPENDENT_ERRORS * len(cameras))
+        self.exposure_weight = 1 / frame_count
         poses = np.stack([camera.world_to_camera for camera in cameras])
         deviations = prior_deviations(cameras, self.pivot, fps, config)
         linear = _gauge_free_steps(cameras, self.pivot, points, velocities, deviations)
@@ -128,17 +129,18 @@ class Corrections:
         return (rgb - behind) * torch.exp(e[:3]) + alpha[..., None] * e[3] + behind
 
     def penalty(self) -> torch.Tensor:
-        """Negative logarithm of the Gaussian prior, a scalar.
+        """Negative logarithm of the Gaussian prior, a scalar; times ``prior_weight`` and a mean image loss, its term.
 
+        An exposure is of one image and the errors of one image speak of it, so it counts less by the number of frames.
         The prior is of a camera's rotation and translation at its own centre, which a rotation about the object moves.
         """
         f, config = self.formation, self.formation.config
         rotation = self.cameras[:, :3]
         shift = self.cameras[:, 3:6] + torch.linalg.cross(f.pivots, rotation)
         at_camera = torch.cat([rotation, shift, self.cameras[:, 6:]], dim=1)
-        total = (at_camera / f.prior_deviations).square().sum()
-        total = total + (self.exposures[..., :3] / config.log_gain).square().sum()
-        return 0.5 * (total + (self.exposures[..., 3] / config.offset).square().sum())
+        gains = (self.exposures[..., :3] / config.log_gain).square().sum()
+        offsets = (self.exposures[..., 3] / config.offset).square().sum()
+        return 0.5 * ((at_camera / f.prior_deviations).square().sum() + f.exposure_weight * (gains + offsets))
 
 
 def rotate(vector: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
@@ -181,11 +183,12 @@ def _gauge_free_steps(
         precision = at_camera.T @ np.diag(deviation**-2) @ at_camera
         jacobian = displacement_jacobian(camera, pivot, points, velocities)
         curvature = np.einsum("pij,pik->jk", jacobian, jacobian) / len(points)
-        block = curvature + REGISTRATION_NOISE_PX**2 * precision
-        # The scale of each quantity is taken out first: radians, metres and seconds have nothing in common.
-        scaled = deviation[:, None] * block * deviation
+        # A step of one is a pixel, or one prior standard deviation where that moves the picture by less. The scale of
+        # each quantity is taken out first: radians, metres and seconds have nothing in common.
+        scaled = deviation[:, None] * (curvature + precision) * deviation
         values, vectors = np.linalg.eigh(scaled)
         steps[rows, rows] = deviation[:, None] * (vectors / np.sqrt(values)) @ vectors.T
+        block = curvature + REGISTRATION_NOISE_PX**2 * precision
         # A common delay is that of the clocks' mean, whatever the cameras do.
         block[7, :7] = block[:7, 7] = 0
         block[7, 7] = 1

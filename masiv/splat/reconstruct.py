@@ -156,7 +156,6 @@ class _Fit:
         velocities = np.gradient(initial.base_motion, 1 / scene.fps, axis=0)[list(initial.frames)]
         surfaces = [hull.points[hull.surface] for hull in initial.hulls]
         surfaces = [points[:: max(1, len(points) // HULL_POINTS)] for points in surfaces]
-        shown = [float(image.mask.sum()) for of_frame in self.images for image in of_frame]
         return ImageFormation(
             [scene.cameras[view] for view in scene.views],
             scene.frame_count,
@@ -164,7 +163,6 @@ class _Fit:
             self.config.calibration,
             np.concatenate(surfaces),
             np.repeat(velocities, [len(points) for points in surfaces], axis=0),
-            float(np.mean(shown)),
         )
 
     @property
@@ -239,8 +237,6 @@ class _Fit:
             for group in self.optimiser.param_groups:
                 if group["name"] == "means" or (group["name"] == "colour_logits" and self.annealing == 0):
                     group["lr"] *= c.canonical_rate_factor
-                if group["name"] == "cameras" and self.annealing == 0:
-                    group["lr"] *= c.calibration.growth_rate_factor
         parts = self.objective.parts(len(self.parameters["means"]), chosen, 1 - self.annealing, rng)
         value = self._compute_gradients(parts)
         if not np.isfinite(value):
