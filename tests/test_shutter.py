@@ -63,7 +63,8 @@ def filmed(camera, at, samples=24):
 
 def exposed(camera, points, velocity):
     seen, where, *rest = drawn(camera, points)
-    return expose(seen, where, velocity.expand(len(points), 3), *rest)
+    exposed = expose(seen, where, velocity.expand(len(points), 3), *rest)
+    return exposed.rgb, exposed.alpha
 
 
 @pytest.mark.parametrize(("shutter", "left"), [(BLURRED, 0.1), (ROLLING, 0.3), (BOTH, 0.3)])

@@ -10,11 +10,10 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.fill import FilledVolume, fill_later_frame
+from masiv.continuum.fill import FilledVolume, fill_later_frame, hull_volume
 from masiv.continuum.finetune import KnownMotion, fine_tune
 from masiv.continuum.trajectory import Trajectory, positions_at
 from masiv.errors import InputError, MasivError
-from masiv.hull.carve import visual_hull
 from masiv.hull.velocity import with_velocities
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
@@ -51,7 +50,7 @@ def extend_trajectory(
         )
     scene = with_velocities(scene, dynamic.base_positions(scene.times))
     start = FilledVolume(trajectory.positions[0].astype(np.float64), trajectory.spacing, trajectory.volume)
-    hull = visual_hull(scene, 0, resolution=config.fill_resolution).volume
+    hull = hull_volume(scene, config)
     volumes = []
     for frame in range(known, scene.frame_count):
         progress("fill new frames", frame - known + 1, scene.frame_count - known)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 
 from masiv.errors import MasivError
+from masiv.hull.depth import DepthView, depth_views, seen_points
 from masiv.hull.silhouette import Silhouette, silhouettes
 from masiv.hull.votes import consensus, vote
 from masiv.scene.scene import Ground, Scene
@@ -38,18 +39,21 @@ def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull
 
     The bounding box follows from the masks; its longest side gets ``resolution`` voxels. A voxel is kept if its centre
     is at most a quarter voxel outside of every mask that shows it (so that thin parts survive) and if it is inside the
-    image of at least two views and of half of them. Raises MasivError if fewer than two masks show the object or no
-    voxel is left.
+    image of at least two views and of half of them. Measured depth removes what is in front of the surface; with it
+    one view suffices, and the hidden side is a guess (``masiv.hull.depth``). Raises MasivError if fewer than two masks
+    show the object, fewer than one with depth, or no voxel is left.
     """
     views = silhouettes(scene, frame)
+    depths = depth_views(scene, frame, views)
     occupied_views = [v for v in views if (v.distance < 0).any()]
-    if len(occupied_views) < 2:
+    if len(occupied_views) < 2 and (not depths or not occupied_views):
         raise MasivError(
             f"frame {frame} of {scene.path}: the object is in the mask of {len(occupied_views)} of {len(views)} views, "
-            "a visual hull needs 2; check the masks of that frame"
+            "a visual hull needs 2, or 1 with depth; check the masks of that frame"
         )
-    grid = occupancy_grid(views, scene, frame, resolution)
-    occupied = occupancy(views, grid.points, 0.25 * grid.spacing, grid.spacing, scene.ground).reshape(grid.counts)
+    grid = occupancy_grid(views, scene, frame, resolution, depths)
+    occupied = occupancy(views, grid.points, 0.25 * grid.spacing, grid.spacing, scene.ground, depths)
+    occupied = occupied.reshape(grid.counts)
     if not occupied.any():
         raise MasivError(_no_volume(views, occupied_views, scene, frame))
     return VisualHull(grid.points[occupied.ravel()], grid.spacing, surface_of(occupied)[occupied])
@@ -64,27 +68,39 @@ class OccupancyGrid:
     counts: np.ndarray
 
 
-def occupancy_grid(views: tuple[Silhouette, ...], scene: Scene, frame: int, resolution: int) -> OccupancyGrid:
+def occupancy_grid(
+    views: tuple[Silhouette, ...], scene: Scene, frame: int, resolution: int, depths: tuple[DepthView, ...] = ()
+) -> OccupancyGrid:
     """The grid of the hull's bounding box, whose longest side has ``resolution`` voxels.
 
     Raises MasivError if the box is empty.
     """
     occupied_views = [view for view in views if (view.distance < 0).any()]
-    lower, upper = _object_box(views, occupied_views, scene.ground, frame, scene)
+    lower, upper = _object_box(views, occupied_views, depths, scene.ground, frame, scene)
     spacing = float((upper - lower).max()) / resolution
     counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
     return OccupancyGrid(_cell_centres(lower, spacing, counts), spacing, counts)
 
 
 def occupancy(
-    views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float, spacing: float, ground: Ground | None = None
+    views: tuple[Silhouette, ...],
+    points: np.ndarray,
+    tolerance: float,
+    spacing: float,
+    ground: Ground | None = None,
+    depths: tuple[DepthView, ...] = (),
 ) -> np.ndarray:
     """Which voxels with centres ``points`` (N, 3) [m] and side ``spacing`` [m] belong to the hull, (N,) bool.
 
-    A voxel is above the ground, inside the image of at least two views and of half of them, and at most ``tolerance``
-    [m] outside of every mask, except where the views outvote one of them: see ``masiv.hull.votes``.
+    A voxel is above the ground, inside the image of at least two views (one of those with depth) and of half of them,
+    and at most ``tolerance`` [m] outside of every mask, except where the views outvote one of them: see
+    ``masiv.hull.votes``. It is at most ``tolerance`` in front of what ``depths`` show.
     """
-    return consensus(views, vote(views, points, tolerance, ground, spacing))
+    votes = vote(views, points, tolerance, ground, spacing, fewest_views=1 if depths else 2)
+    for depth in depths:
+        empty = np.maximum(depth.in_front(points), depth.behind(points)) > tolerance
+        votes = replace(votes, allowed=votes.allowed & ~empty)
+    return consensus(views, votes)
 
 
 def surface_of(occupied: np.ndarray) -> np.ndarray:
@@ -92,9 +108,9 @@ def surface_of(occupied: np.ndarray) -> np.ndarray:
     return occupied & ~ndimage.binary_erosion(occupied)
 
 
-def _object_box(views, seen, ground, frame: int, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def _object_box(views, seen, depths, ground, frame: int, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Corners (3,), (3,) [m] of the hull's bounding box, from coarse grids that shrink."""
-    centre = _nearest_to_rays(seen)
+    centre = _middle(seen, depths)
     radius = max(_radius_around(view, centre) for view in seen)
     lower, upper = centre - radius, centre + radius
     for _ in range(_BOX_ROUNDS):
@@ -102,7 +118,7 @@ def _object_box(views, seen, ground, frame: int, scene: Scene) -> tuple[np.ndarr
         counts = np.maximum(np.ceil((upper - lower) / spacing - 1e-9).astype(int), 1)
         grid = _cell_centres(lower, spacing, counts)
         # Half of a cell's diagonal: no cell that contains a part of the object is removed.
-        kept = grid[occupancy(views, grid, 0.87 * spacing, spacing, ground)]
+        kept = grid[occupancy(views, grid, 0.87 * spacing, spacing, ground, depths)]
         if len(kept) == 0:
             raise MasivError(_no_volume(views, seen, scene, frame))
         lower, upper = (
@@ -129,6 +145,14 @@ def _nearest_to_rays(seen: list[Silhouette]) -> np.ndarray:
         normal_matrix += across
         right_side += across @ view.camera.centre
     return np.linalg.lstsq(normal_matrix, right_side, rcond=None)[0]
+
+
+def _middle(seen: list[Silhouette], depths: tuple[DepthView, ...]) -> np.ndarray:
+    """A point (3,) [m] in the middle of the object: of its rays, or of its depth if one view alone shows it."""
+    if len(seen) > 1:
+        return _nearest_to_rays(seen)
+    points = seen_points(depths)
+    return (points.min(axis=0) + points.max(axis=0)) / 2
 
 
 def _radius_around(view: Silhouette, centre: np.ndarray) -> float:

@@ -47,11 +47,18 @@ class Votes:
 
 
 def vote(
-    views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float, ground: Ground | None, spacing: float
+    views: tuple[Silhouette, ...],
+    points: np.ndarray,
+    tolerance: float,
+    ground: Ground | None,
+    spacing: float,
+    *,
+    fewest_views: int = 2,
 ) -> Votes:
     """The votes of ``views`` on voxels with centres ``points`` (N, 3) [m] and side ``spacing`` [m].
 
-    A view denies a voxel whose centre is more than ``tolerance`` [m] outside of its mask.
+    A view denies a voxel whose centre is more than ``tolerance`` [m] outside of its mask. A voxel is allowed if
+    ``fewest_views`` and half of the views show it.
     """
     denied = np.zeros((len(points), len(views)), np.float32)
     cells = np.full((len(points), len(views)), -1, np.int64)
@@ -66,7 +73,7 @@ def vote(
         side = _cell_side(view, depth, spacing)
         cells[visible, k] = rows // side * _columns(view, side) + columns // side
         sides.append(side)
-    allowed = shown >= max(2, len(views) // 2)
+    allowed = shown >= max(fewest_views, len(views) // 2)
     if ground is not None:
         allowed &= points @ ground.normal >= ground.height - 0.5 * tolerance
     return Votes(denied, cells, tuple(sides), allowed)

@@ -59,7 +59,7 @@ def identity(source: Scene | Tracks) -> dict[str, Any]:
     """What distinguishes scenes, as plain values: numbers that people can compare, and digests of the rest.
 
     Of tracks everything counts but the folder: data, geometry, mass, clamp, placement, medium, gravity. Of a video, the
-    first and the last picture stand for all of them.
+    first and the last picture (with its depth) or point cloud stand for all of them.
     """
     return _tracks_identity(source) if isinstance(source, Tracks) else _scene_identity(source)
 
@@ -69,9 +69,15 @@ def _scene_identity(scene: Scene) -> dict[str, Any]:
     for camera in scene.cameras:
         cameras.update(np.round([*camera.intrinsics.ravel(), *camera.world_to_camera.ravel()], 6).tobytes())
     visible = scene.views
+    if scene.load_cloud is not None:
+        ends = [scene.cloud(frame) for frame in (0, scene.frame_count - 1)]
+        return {**conventions(scene), "clouds_sha256": content_hash(ends, DIGITS)[:16]}
     for view, frame in ((visible[0], 0), (visible[-1], scene.frame_count - 1)):
-        pictures.update(scene.frame(view, frame).image.tobytes())
-        pictures.update(scene.frame(view, frame).mask.tobytes())
+        picture = scene.frame(view, frame)
+        pictures.update(picture.image.tobytes())
+        pictures.update(picture.mask.tobytes())
+        if picture.depth is not None:
+            pictures.update(picture.depth.tobytes())
     return {
         **conventions(scene),
         "cameras_sha256": cameras.hexdigest()[:16],

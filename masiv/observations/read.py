@@ -7,7 +7,15 @@ from pathlib import Path
 
 from masiv.errors import InputError
 from masiv.hull.consistent_masks import consistent_masks
-from masiv.scene import blender, nerfstudio, pacnerf, springgaus_real, springgaus_synthetic
+from masiv.scene import (
+    blender,
+    nerfstudio,
+    pacnerf,
+    phystwin,
+    point_clouds,
+    springgaus_real,
+    springgaus_synthetic,
+)
 from masiv.scene.layout import Layout
 from masiv.scene.scene import Scene
 from masiv.tracks import read as tracks
@@ -20,6 +28,8 @@ LAYOUTS: tuple[Layout[Scene | Tracks], ...] = (
     springgaus_real.LAYOUT,
     nerfstudio.LAYOUT,
     blender.LAYOUT,
+    phystwin.LAYOUT,
+    point_clouds.LAYOUT,
 )
 """All layouts, in the order in which they are tried."""
 

@@ -132,7 +132,9 @@ class VideoRun(Run):
         refuse(request, ("condition",), "tracks", self.folder.scene_path)
         self.folder.require("identify")
         views = request.view or (0,)
-        for index in views:
+        if request.render and not self.scene.cameras:
+            raise InputError(f"{self.scene.path} has point clouds and no cameras: leave out --render")
+        for index in views if request.render or request.view else ():
             if not 0 <= index < len(self.scene.cameras):
                 raise InputError(f"--view {index}: the scene has cameras 0 to {len(self.scene.cameras) - 1}")
         if request.force is None and (request.force_from is not None or request.force_until is not None):

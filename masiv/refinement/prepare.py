@@ -63,7 +63,11 @@ def prepare(
     )
     noise = max(noise_floor(fitted.positions, motion.last_frame), MIN_NOISE)
     positions = torch.cat([body.particles[None], body.targets]).double().numpy()
-    lost = config.tracking_error * beyond_rigid(positions) if scene.cameras else np.zeros(len(body.targets))
+    lost = (
+        config.tracking_error * beyond_rigid(positions)
+        if scene.cameras or scene.load_cloud
+        else np.zeros(len(body.targets))
+    )
     observation = VideoObservation(
         name=name,
         times=np.arange(1, len(body.targets) + 1) / (samples * scene.fps),

@@ -1,4 +1,4 @@
-"""One picture of a scene: a row a view, a column a frame, the mask's outline drawn."""
+"""One picture of a scene: a row a view, a column a frame, the mask's outline drawn. Point clouds from two sides."""
 
 from __future__ import annotations
 
@@ -23,10 +23,35 @@ def contact_sheet(
     notes: what is written into the first picture of a view.
     """
     frames = np.unique(np.linspace(0, scene.frame_count - 1, min(columns, scene.frame_count)).round().astype(int))
+    if scene.load_cloud is not None:
+        return _clouds(scene, frames, tile)
     rows = [np.concatenate([_tile(scene, view, int(frame), tile) for frame in frames], axis=1) for view in scene.views]
     for row, view in zip(rows, scene.views, strict=True):
         if notes and view in notes:
             _write(row, notes[view], (3, row.shape[0] - 5))
+    return np.concatenate(rows, axis=0)
+
+
+def _clouds(scene: Scene, frames: np.ndarray, tile: int) -> np.ndarray:
+    """A row for each of two horizontal directions, ``up`` upwards; darker where there are more points."""
+    clouds = [scene.cloud(int(frame)).points for frame in frames]
+    seed = np.eye(3)[np.argmin(np.abs(scene.up))]
+    across = np.cross(scene.up, seed) / np.linalg.norm(np.cross(scene.up, seed))
+    together = np.concatenate(clouds)
+    centre, size = (together.min(axis=0) + together.max(axis=0)) / 2, 1.05 * float(np.ptp(together, axis=0).max())
+    rows = []
+    for row, side in enumerate((across, np.cross(across, scene.up))):
+        tiles = []
+        for frame, points in zip(frames, clouds, strict=True):
+            place = 0.5 + np.stack([(points - centre) @ side, -(points - centre) @ scene.up]) / size
+            x, y = np.clip((place * tile).astype(int), 0, tile - 1)
+            count = np.bincount(y * tile + x, minlength=tile * tile).reshape(tile, tile)
+            grey = np.where(count > 0, 170 - 150 * np.minimum(count, 4) / 4, 245).astype(np.uint8)
+            drawn = np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2))
+            drawn[:, -1] = 200
+            cv2.putText(drawn, f"{row}:{frame}", (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
+            tiles.append(drawn)
+        rows.append(np.concatenate(tiles, axis=1))
     return np.concatenate(rows, axis=0)
 
 

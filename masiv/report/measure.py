@@ -69,6 +69,25 @@ def picture_numbers(
     return {"views": list(views), "frames": list(frames), **means, **curve}
 
 
+def cloud_numbers(
+    scene: Scene, gaussians_at: Callable[[int], Gaussians], frames: Sequence[int]
+) -> dict[str, Any] | None:
+    """Chamfer distance of the Gaussians, which are points of the first cloud, to the cloud of each of ``frames``; None
+    without a frame."""
+    if not frames:
+        return None
+    found = []
+    for frame in frames:
+        means = gaussians_at(frame).means.detach().double().numpy()
+        found.append(metrics.chamfer_1e3mm2(means, scene.cloud(frame).points, max(len(means), 8192)))
+    return {
+        "views": [],
+        "frames": list(frames),
+        "chamfer_1e3mm2": float(np.mean(found)),
+        "chamfer_1e3mm2_by_frame": found,
+    }
+
+
 def agreement(rollout: np.ndarray, trajectory: np.ndarray) -> dict[str, Any]:
     """RMSE [mm] between the twin's particles (T, Q parts, 3) and the estimated ones (T, Q, 3), over frames 1…T−1.
 

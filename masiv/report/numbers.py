@@ -29,8 +29,10 @@ def _views(run: RunFolder, scene: Scene) -> tuple[list[int], list[int]]:
 
 
 def reconstruction_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussians) -> dict[str, Any]:
-    """Pictures of the Gaussians on the fitted frames, seen and held-out cameras apart."""
+    """Pictures of the Gaussians on the fitted frames, seen and held-out cameras apart; or point clouds."""
     frames = list(range(run.fit_frames))
+    if scene.load_cloud is not None:
+        return {"point_clouds": measure.cloud_numbers(scene, lambda f: dynamic.at(f / scene.fps), frames)}
     training, held_out = _views(run, scene)
     return {
         name: measure.picture_numbers(scene, lambda f: dynamic.at(f / scene.fps), views, frames)
@@ -39,8 +41,14 @@ def reconstruction_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussia
 
 
 def twin_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout: np.ndarray) -> dict[str, Any]:
-    """Pictures of the Gaussians moved by the twin's particles, over fitted and future frames, on every camera."""
+    """Pictures of the Gaussians moved by the twin's particles, over fitted and future frames, on every camera; or point
+    clouds."""
     binding = Binding.at_rest(dynamic.at(0.0), rollout[0])
+    if scene.load_cloud is not None:
+        return {
+            name: measure.cloud_numbers(scene, lambda f: binding.moved(rollout[f]), frames)
+            for name, frames in _split(run, scene)
+        }
     views = list(range(len(scene.cameras)))
     return {
         name: measure.picture_numbers(scene, lambda f: binding.moved(rollout[f]), views, frames)

@@ -45,12 +45,21 @@ def write_report(
     numbers: Mapping[str, Any],
 ) -> None:
     """Write the run's report.html. ``numbers`` is what metrics.json holds, rollout (T, Q, 3) [m] covers every frame."""
+    training = [view for view in range(len(scene.cameras)) if view not in run.holdout_cameras]
     page = Page(f"Digital twin of {scene.path.resolve().name}")
+    seen = "Point clouds" if scene.load_cloud is not None else f"{len(scene.cameras)} cameras"
+    if scene.depth_noise is not None:
+        seen += " with depth"
     page.note(
-        f"{len(scene.cameras)} cameras, {scene.frame_count} frames at {scene.fps:g} fps; fitted on frames 0 to "
+        f"{seen}, {scene.frame_count} frames at {scene.fps:g} fps; fitted on frames 0 to "
         f"{run.fit_frames - 1}; cameras kept out of the fit: {', '.join(map(str, run.holdout_cameras)) or 'none'}."
     )
-    page.heading("Observed, reconstructed, simulated")
+    if len(training) == 1:
+        page.note(
+            "One camera saw the object: the side that it did not see is a guess, as deep as the silhouette is wide."
+        )
+    if scene.cameras:
+        page.heading("Observed, reconstructed, simulated")
     for view in shown_views(run, scene):
         role = "not seen by the fit" if view in run.holdout_cameras else "seen by the fit"
         page.video(
@@ -79,7 +88,10 @@ def write_report(
         plots.over_frames({"twin": (range(len(fit)), fit)}, "twin to trajectory", "RMSE [mm]", run.fit_frames),
         "distance between twin and trajectory",
     )
-    page.picture(_picture_curves(run, numbers), "PSNR over frames")
+    if scene.cameras:
+        page.picture(_picture_curves(run, numbers), "PSNR over frames")
+    else:
+        page.picture(_cloud_curves(run, numbers), "distance to the point clouds over frames")
     losses = curves(run.log)
     if losses:
         page.heading("Convergence")
@@ -134,6 +146,16 @@ def comparison_video(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, ro
         path = Path(folder) / "comparison.mp4"
         write_video(path, comparison_frames(run, scene, dynamic, rollout, view), scene.fps, repeat=SLOWER)
         return path.read_bytes()
+
+
+def _cloud_curves(run: RunFolder, numbers: Mapping[str, Any]) -> bytes:
+    named = {"reconstruction": [numbers["reconstruction"]["point_clouds"]], "twin": list(numbers["twin"].values())}
+    found: dict[str, tuple[list[int], list[float | None]]] = {}
+    for name, blocks in named.items():
+        known = [block for block in blocks if block]
+        frames = [frame for block in known for frame in block["frames"]]
+        found[name] = frames, [value for block in known for value in block["chamfer_1e3mm2_by_frame"]]
+    return plots.over_frames(found, "distance to the point clouds", "Chamfer [10³ mm²]", run.fit_frames)
 
 
 def _picture_curves(run: RunFolder, numbers: Mapping[str, Any]) -> bytes:

@@ -52,6 +52,10 @@ def assemble(
     corners = declaration.crop_corners()
     if corners is not None:
         pictures = replace(pictures, crops=tuple(crop_mask(camera, corners) for camera in cameras))
+    if declaration.depth_unit is not None:
+        pictures = replace(pictures, depth_unit=declaration.depth_unit)
+    if declaration.depth_noise is not None:
+        pictures = replace(pictures, depth_noise=declaration.depth_noise.noise())
     source, more = pictures.mask_sources()
     return Scene(
         path=folder,
@@ -67,21 +71,23 @@ def assemble(
         mask_source=source,
         masks_estimated=any(mask.kind in ("background", "plain") for mask in pictures.masks.values()),
         background=pictures.background,
-        problems=(*problems, *_guesses(declaration, conventions), *gaps, *more),
+        problems=(*problems, *guesses(declaration, conventions), *gaps, *more, *pictures.depth_problems()),
         fit_frames=declaration.fit_frames,
+        depth_noise=pictures.depth_noise if pictures.depths else None,
         missing=frozenset((v, k) for v in range(len(cameras)) for k in range(frame_count)) - pictures.paths.keys(),
     )
 
 
-def _guesses(declaration: SceneDeclaration, conventions: Conventions) -> list[str]:
-    guesses = []
+def guesses(declaration: SceneDeclaration, conventions: Conventions) -> list[str]:
+    """A sentence for each convention that the files neither define nor contradict."""
+    found = []
     if conventions.up_assumed and declaration.up_axis is None:
-        guesses.append(f"the layout does not say which way is up: +{conventions.up} is taken, as is usual in it")
+        found.append(f"the layout does not say which way is up: +{conventions.up} is taken, as is usual in it")
     if conventions.ground_height is None and declaration.ground is None:
-        guesses.append(
+        found.append(
             "the layout says nothing of a ground: none is assumed; if the object touches one, give ground in scene.yaml"
         )
-    return guesses
+    return found
 
 
 def _gaps(folder: Path, pictures: Pictures, frame_count: int) -> list[str]:

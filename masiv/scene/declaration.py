@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from masiv.errors import InputError
 from masiv.scene.camera import Camera
+from masiv.scene.depth import DepthNoise
 from masiv.scene.scene import Ground
 from masiv.scene.shutter import Shutter
 from masiv.strict import read_yaml, validated
@@ -28,6 +29,18 @@ class GroundDeclaration(BaseModel):
     height: FiniteFloat = 0.0
 
 
+class DepthNoiseDeclaration(BaseModel):
+    """See ``masiv.scene.depth.DepthNoise``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    constant: Annotated[FiniteFloat, Field(gt=0)] = DepthNoise().constant
+    quadratic: Annotated[FiniteFloat, Field(ge=0)] = DepthNoise().quadratic
+
+    def noise(self) -> DepthNoise:
+        """As the readers and stages take it."""
+        return DepthNoise(self.constant, self.quadratic)
+
+
 class SceneDeclaration(BaseModel):
     """Keys of ``scene.yaml``. A missing key has the default of the layout.
 
@@ -35,7 +48,8 @@ class SceneDeclaration(BaseModel):
     magnitude along −up. ground: `none` or {normal, height}. density [kg/m³]. crop_box: two opposite corners [m, world];
     masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given. exposure_time [s]: of a
     row. readout_time [s]: of a rolling shutter, from the top row to the last one; negative if the last row is read
-    first. Both are one number, or a mapping from names of cameras; those that are not in it have 0.
+    first. Both are one number, or a mapping from names of cameras; those that are not in it have 0. depth_unit [m]: of
+    the steps of depth pictures. depth_noise: standard deviation of a depth z, constant [m] + quadratic [1/m] z².
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -48,6 +62,8 @@ class SceneDeclaration(BaseModel):
     fit_frames: Annotated[int, Field(ge=2)] | None = None
     exposure_time: NotNegative | dict[str, NotNegative] = 0.0
     readout_time: FiniteFloat | dict[str, FiniteFloat] = 0.0
+    depth_unit: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    depth_noise: DepthNoiseDeclaration | None = None
 
     @field_validator("up_axis", mode="before")
     @classmethod

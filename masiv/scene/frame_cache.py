@@ -18,17 +18,20 @@ class Frame:
     """One picture of one view.
 
     image (H, W, 3) uint8 RGB; mask (H, W) float32 in [0, 1], 1 on the object; valid (H, W) bool, False if an occluder
-    hides the scene or there is no picture.
+    hides the scene or there is no picture. depth (H, W) float32 [m] along the optical axis, 0 where it is unknown;
+    None if the recording has none.
     """
 
     image: np.ndarray
     mask: np.ndarray
     valid: np.ndarray
+    depth: np.ndarray | None = None
 
     @property
     def nbytes(self) -> int:
         """Memory of the arrays [bytes]."""
-        return self.image.nbytes + self.mask.nbytes + self.valid.nbytes
+        depth = 0 if self.depth is None else self.depth.nbytes
+        return self.image.nbytes + self.mask.nbytes + self.valid.nbytes + depth
 
 
 class FrameCache:

@@ -101,6 +101,15 @@ class Lens:
             values[..., :3] *= 255 / np.maximum(values[..., 3:], 0.5)
         return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
+    def undistort_nearest(self, values: np.ndarray) -> np.ndarray:
+        """Values (H, W), for example depths, of the nearest pixels; 0 outside of the original picture.
+
+        A mean over an edge would be the depth of a point that is on no surface.
+        """
+        if self.is_pinhole:
+            return values
+        return cv2.remap(values, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
 
 def read_lens(row: Mapping[str, Any], width: int, height: int, where: str) -> Lens:
     """The lens of a nerfstudio, instant-ngp or Blender listing, for pictures of ``width`` × ``height`` pixels.

@@ -2,7 +2,8 @@
 
 ``transforms.json`` contains a camera, for all pictures or for each: fl_x, fl_y, cx, cy, w, h [pixels], k1, k2, p1, p2,
 camera_model (or camera_angle_x [rad]); and frames: {file_path, transform_matrix 4×4 [m], camera to world, OpenGL axes,
-time [s], mask_path?}. The mask is alpha, else mask_path (white on the object), else the difference from the view's
+time [s], mask_path?, depth_file_path?}. Depth pictures have 16 bits, in steps of ``depth_unit_scale_factor`` [m], a
+millimetre unless given. The mask is alpha, else mask_path (white on the object), else the difference from the view's
 picture before time 0. Pictures are undistorted when they are read. World: metres, z up, no ground.
 """
 

@@ -2,8 +2,9 @@
 
 ``all_data.json`` lists {file_path, c2w 3×4 [m], camera to world, OpenGL axes, intrinsic 3×3 [pixels], time [s]}.
 Pictures are ``data/r_V_F.png`` for view V and frame F; frame −1 is the empty background, frame −2 an occluder. Masks:
-``data/a_V_F.png`` (alpha) or ``data/m_V_F.png`` (the object on white), else the difference to the background. World:
-metres, y up, gravity 9.8 m/s², ground at y = 0.
+``data/a_V_F.png`` (alpha) or ``data/m_V_F.png`` (the object on white), else the difference to the background. Depth,
+if any: ``data/d_V_F.png`` (16 bits, millimetres), and ``data/d_V_-1.png`` of the empty scene. World: metres, y up,
+gravity 9.8 m/s², ground at y = 0.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from masiv.scene.declaration import read_declaration
 from masiv.scene.layout import Layout
 from masiv.scene.listing import entries as listed_entries
 from masiv.scene.listing import read_json
-from masiv.scene.pictures import PLAIN, MaskSource, Pictures, common_size
+from masiv.scene.pictures import DEPTH, PLAIN, MaskSource, Pictures, common_size
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import frame_of_time, opengl_c2w_to_world_to_camera, round_if_close
 
@@ -61,12 +62,19 @@ def read(folder: Path) -> Scene:
     cameras = tuple(_camera(view, observed, present, listing) for view in view_ids)
     backgrounds = _extra_pictures(entries, folder, view_ids, BACKGROUND)
     paths = {(view_ids.index(e.view), e.frame): e.path for e in present}
+    depths = {key: depth for key, path in paths.items() if (depth := _sibling(path, "d")).is_file()}
+    empty_depths = {i: path for i, v in enumerate(view_ids) if (path := folder / "data" / f"d_{v}_-1.png").is_file()}
     pictures = Pictures(
         paths=paths,
-        masks={key: _mask_source(path, key[0] in backgrounds) for key, path in paths.items()},
+        masks={
+            key: _mask_source(path, key[0] in backgrounds, key in depths and key[0] in empty_depths)
+            for key, path in paths.items()
+        },
         cameras=cameras,
         backgrounds=backgrounds,
         occluders=_extra_pictures(entries, folder, view_ids, OCCLUDER),
+        depths=depths,
+        empty_depths=empty_depths,
     )
     return assemble(folder, "pacnerf", declaration, CONVENTIONS, pictures, fps=fps, frame_count=frame_count)
 
@@ -145,12 +153,14 @@ def _extra_pictures(entries: list[_Entry], folder: Path, view_ids: list[int], fr
     return {i: path for i, path in paths.items() if path.is_file()}
 
 
-def _mask_source(path: Path, has_background: bool) -> MaskSource:
+def _mask_source(path: Path, has_background: bool, has_depth: bool) -> MaskSource:
     if (alpha := _sibling(path, "a")).is_file():
         return MaskSource("alpha", "alpha pictures a_V_F.png", alpha)
     if (cutout := _sibling(path, "m")).is_file():
         return MaskSource("cutout", "cut-outs on white m_V_F.png", cutout)
-    return MaskSource("background", "difference from the background frame −1") if has_background else PLAIN
+    if has_background:
+        return MaskSource("background", "difference from the background frame −1")
+    return DEPTH if has_depth else PLAIN
 
 
 def _sibling(path: Path, kind: str) -> Path:

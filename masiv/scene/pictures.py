@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 from masiv.errors import InputError
-from masiv.scene import masks
+from masiv.scene import depth_masks, masks
 from masiv.scene.background import BackgroundModel, learn_background
 from masiv.scene.camera import Camera
+from masiv.scene.depth import MILLIMETRE, DepthNoise, depth_size, read_depth
 from masiv.scene.lens import Lens
 from masiv.scene.scene import Frame
 
@@ -30,16 +31,17 @@ class MaskSource:
 
     alpha: the fourth channel of ``path``, or of the picture itself. mask: ``path`` is white on the object. cutout:
     ``path`` has all but the object painted white. background: difference from the view's empty background. plain:
-    difference from the border's colour.
+    difference from the border's colour. depth: what is nearer than the view's empty scene.
     """
 
-    kind: Literal["alpha", "mask", "cutout", "background", "plain"]
+    kind: Literal["alpha", "mask", "cutout", "background", "plain", "depth"]
     description: str
     path: Path | None = None
 
 
 PLAIN = MaskSource("plain", "plain background")
 OWN_ALPHA = MaskSource("alpha", "alpha channel of the pictures")
+DEPTH = MaskSource("depth", "depth, nearer than that of the empty scene")
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class Pictures:
 
     By camera: ``lenses`` to undistort; ``backgrounds``, pictures of the empty scene; ``occluders``, pictures with
     positive alpha on what hides the scene; ``crops`` (H, W) bool, False outside of the declared crop box.
+    ``depths``: depth pictures in steps of ``depth_unit`` [m], with ``depth_noise``; ``empty_depths``, by camera, of the
+    empty scene.
     """
 
     paths: dict[Key, Path]
@@ -57,6 +61,10 @@ class Pictures:
     backgrounds: dict[int, Path] = field(default_factory=dict)
     occluders: dict[int, Path] = field(default_factory=dict)
     crops: tuple[np.ndarray, ...] | None = None
+    depths: dict[Key, Path] = field(default_factory=dict)
+    empty_depths: dict[int, Path] = field(default_factory=dict)
+    depth_unit: float = MILLIMETRE
+    depth_noise: DepthNoise = field(default_factory=DepthNoise)
 
     def load(self, view: int, frame: int) -> Frame:
         """The picture of ``view`` at ``frame``. One that does not exist is black, and not valid anywhere.
@@ -66,13 +74,14 @@ class Pictures:
         camera = self.cameras[view]
         path = self.paths.get((view, frame))
         if path is None:
-            return _missing_frame(camera.height, camera.width)
+            return _missing_frame(camera.height, camera.width, with_depth=bool(self.depths))
         image = self._read(view, path)
         if self.masks[view, frame] == OWN_ALPHA and image.shape[-1] != 4:
             raise InputError(
                 f"{path} has no alpha channel, unlike other pictures of {camera.name}: its mask is unknown"
             )
-        mask = self._mask(view, self.masks[view, frame], image)
+        depth = self._depth(view, self.depths.get((view, frame))) if self.depths else None
+        mask = self._mask(view, self.masks[view, frame], image, depth)
         valid = np.ones(image.shape[:2], bool)
         if view in self.lenses:
             valid &= self.lenses[view].visible
@@ -82,7 +91,9 @@ class Pictures:
                 valid &= occluder[..., 3] <= OCCLUDER_ALPHA
         if self.crops is not None:
             mask = mask * self.crops[view]
-        return Frame(image[..., :3], mask, valid)
+        if depth is not None:
+            depth = np.where(valid, depth, np.float32(0))
+        return Frame(image[..., :3], mask, valid, depth)
 
     def background(self, view: int) -> np.ndarray | None:
         """The empty scene in ``view``, (H, W, 3) uint8, or None if there is no picture of it."""
@@ -99,7 +110,34 @@ class Pictures:
             problems.append("the occluder pictures (frame −2) have no alpha channel and are ignored")
         return main, problems
 
-    def _mask(self, view: int, source: MaskSource, image: np.ndarray) -> np.ndarray:
+    def depth_problems(self) -> list[str]:
+        """What the depth pictures lack. Raises InputError for one that has another size than its camera."""
+        for key, path in (*self.depths.items(), *(((view, -1), path) for view, path in self.empty_depths.items())):
+            camera, size = self.cameras[key[0]], depth_size(path)
+            if size != (camera.width, camera.height):
+                raise InputError(
+                    f"{path} is {size[0]}×{size[1]}, the pictures of {camera.name} are {camera.width}×{camera.height}: "
+                    "align the depth pictures with the colour pictures"
+                )
+        lacking = [path.name for key, path in self.paths.items() if key not in self.depths]
+        problems = []
+        if self.depths and lacking:
+            problems.append(f"{len(lacking)} of {len(self.paths)} pictures ({lacking[0]}, …) have no depth")
+        if self.depths and len(self.cameras) == 1:
+            problems.append(
+                "one camera: the side of the object that it does not see is a guess, as deep as the silhouette is wide"
+            )
+        return problems
+
+    def _depth(self, view: int, path: Path | None) -> np.ndarray:
+        """Depth (H, W) [m] as the pinhole camera sees it, 0 where it is unknown."""
+        camera = self.cameras[view]
+        if path is None:
+            return np.zeros((camera.height, camera.width), np.float32)
+        depth = read_depth(path, self.depth_unit)
+        return self.lenses[view].undistort_nearest(depth) if view in self.lenses else depth
+
+    def _mask(self, view: int, source: MaskSource, image: np.ndarray, depth: np.ndarray | None) -> np.ndarray:
         other = None if source.path is None else self._read(view, source.path)
         colour = np.ascontiguousarray(image[..., :3])
         if source.kind == "alpha":
@@ -111,6 +149,8 @@ class Pictures:
             return masks.from_white(other[..., :3], colour)
         if source.kind == "background":
             return self._background_model.mask(view, colour)
+        if source.kind == "depth" and depth is not None:
+            return depth_masks.from_empty_depth(depth, self._depth(view, self.empty_depths[view]), self.depth_noise)
         return masks.from_plain_background(colour)
 
     @cached_property
@@ -199,6 +239,7 @@ def _as_mask(pixels: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _missing_frame(height: int, width: int) -> Frame:
+def _missing_frame(height: int, width: int, *, with_depth: bool) -> Frame:
     shape = height, width
-    return Frame(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32), np.zeros(shape, bool))
+    depth = np.zeros(shape, np.float32) if with_depth else None
+    return Frame(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32), np.zeros(shape, bool), depth)

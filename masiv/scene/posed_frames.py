@@ -14,6 +14,7 @@ from masiv.errors import InputError
 from masiv.scene.assemble import Conventions, assemble
 from masiv.scene.camera import Camera
 from masiv.scene.declaration import SceneDeclaration
+from masiv.scene.depth import MILLIMETRE
 from masiv.scene.lens import Lens, read_lens
 from masiv.scene.listing import array, entries, mapping, number, read_json, text
 from masiv.scene.pictures import OWN_ALPHA, PLAIN, MaskSource, Pictures, common_size, has_transparency, image_size
@@ -25,7 +26,10 @@ SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 
 @dataclass(frozen=True, eq=False)
 class PosedPicture:
-    """One entry of a listing. ``where`` names it in messages; ``time`` [s], negative for an empty background."""
+    """One entry of a listing. ``where`` names it in messages; ``time`` [s], negative for an empty background.
+
+    depth: the depth picture, in steps of ``depth_unit`` [m].
+    """
 
     path: Path
     mask: Path | None
@@ -33,6 +37,8 @@ class PosedPicture:
     world_to_camera: np.ndarray
     lens: Lens
     where: str
+    depth: Path | None = None
+    depth_unit: float = MILLIMETRE
 
     @cached_property
     def signature(self) -> np.ndarray:
@@ -160,7 +166,16 @@ class _Views:
             cameras=tuple(cameras),
             lenses=lenses,
             backgrounds=self.backgrounds,
+            depths={key: picture.depth for key, picture in self.at.items() if picture.depth is not None},
+            depth_unit=self._depth_unit(),
         )
+
+    def _depth_unit(self) -> float:
+        units = {p.depth_unit: p for p in self.at.values() if p.depth is not None}
+        if len(units) > 1:
+            (one, a), (other, b), *_ = units.items()
+            raise InputError(f"depth_unit_scale_factor is {one:g} at {a.where} and {other:g} at {b.where}: give one")
+        return next(iter(units), MILLIMETRE)
 
     def _name(self, view: int) -> str:
         """The folder, if it contains the pictures of this view only, else the name of the first picture."""
@@ -191,7 +206,12 @@ def _picture(folder: Path, common: Mapping[str, Any], row: Any, where: str) -> P
     except InputError as error:
         raise InputError(str(error) if where in str(error) else f"{where}: {error}") from error
     mask = _existing(folder, text(row, "mask_path", where), where) if row.get("mask_path") else None
-    return PosedPicture(path, mask, number(row, "time", where), pose, read_lens(row, *image_size(path), where), where)
+    depth = _existing(folder, text(row, "depth_file_path", where), where) if row.get("depth_file_path") else None
+    unit = number(row, "depth_unit_scale_factor", where, MILLIMETRE)
+    if unit <= 0:
+        raise InputError(f"{where}: depth_unit_scale_factor is {unit:g}, it is a length in metres")
+    lens = read_lens(row, *image_size(path), where)
+    return PosedPicture(path, mask, number(row, "time", where), pose, lens, where, depth, unit)
 
 
 def _existing(folder: Path, name: str, where: str) -> Path:

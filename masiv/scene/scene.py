@@ -12,6 +12,8 @@ import numpy as np
 
 from masiv.errors import InputError
 from masiv.scene.camera import Camera
+from masiv.scene.cloud import Cloud
+from masiv.scene.depth import DepthNoise
 from masiv.scene.frame_cache import Frame, FrameCache
 
 
@@ -37,11 +39,11 @@ class Scene:
     mask_source: where masks come from, for messages. masks_estimated: from colours, none was given.
     correct_masks: makes the masks of the views of one frame agree, see ``masiv.hull.consistent_masks``; None for masks
     that are given. hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences
-    for the user.
-    velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for silhouettes of
-    views that show other times than the frame's.
-    missing: (view, frame) of which there is no picture.
-    time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
+    for the user. velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for
+    silhouettes of views that show other times than the frame's. time_offsets [s]: of the cameras' clocks, empty if all
+    are exact. A picture was taken at frame / fps + offset. missing: (view, frame) of which there is no picture.
+    depth_noise: None if the pictures have no depth. ``load_cloud(frame)``: for a recording of point clouds, which has
+    no cameras; ``cloud(frame)`` also checks that this scene contains it.
     """
 
     path: Path
@@ -61,6 +63,8 @@ class Scene:
     correct_masks: Callable[[Scene, int], Mapping[int, Frame]] | None = None
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
+    depth_noise: DepthNoise | None = None
+    load_cloud: Callable[[int], Cloud] | None = None
     velocities: np.ndarray | None = None
     time_offsets: tuple[float, ...] = ()
     missing: frozenset[tuple[int, int]] = frozenset()
@@ -84,11 +88,6 @@ class Scene:
         return tuple(v for v in range(len(self.cameras)) if v not in self.hidden_views)
 
     @property
-    def view_time_offsets(self) -> tuple[float, ...]:
-        """``time_offsets`` [s] of ``views``; empty if all clocks are exact."""
-        return tuple(self.time_offsets[view] for view in self.views) if any(self.time_offsets) else ()
-
-    @property
     def observed_frames(self) -> tuple[int, ...]:
         """Frames of which a camera that is not held out has a picture."""
         if not self.missing:
@@ -102,6 +101,11 @@ class Scene:
     def shows_other_times(self, view: int) -> bool:
         """Whether pixels of ``view`` show other times than that of their frame: rolling shutter, clock."""
         return self.cameras[view].shutter.readout_time != 0 or self.time_offset(view) != 0
+
+    @property
+    def view_time_offsets(self) -> tuple[float, ...]:
+        """``time_offsets`` [s] of ``views``; empty if all clocks are exact."""
+        return tuple(self.time_offsets[view] for view in self.views) if any(self.time_offsets) else ()
 
     def frame(self, view: int, frame: int) -> Frame:
         """The picture of ``view`` at ``frame``; ``valid`` is False everywhere if there is none.
@@ -124,6 +128,12 @@ class Scene:
         cache = FrameCache(corrected)
         return cache
 
+    def cloud(self, frame: int) -> Cloud:
+        """The point cloud of ``frame``. Raises InputError if the frame is held out, or the recording has no clouds."""
+        if self.load_cloud is None or not 0 <= frame < self.frame_count:
+            raise InputError(f"frame {frame} of {self.path} has no point cloud that this stage may see")
+        return self.load_cloud(frame)
+
     def restricted(self, fit_frames: int | None = None, holdout_cameras: tuple[int, ...] = ()) -> Scene:
         """The first ``fit_frames`` frames (None: all) without ``holdout_cameras``: the training data of a fit.
 
@@ -134,10 +144,12 @@ class Scene:
             raise InputError(
                 f"--fit-frames {count}: the scene has {self.frame_count} frames, give 2 to {self.frame_count}"
             )
+        if holdout_cameras and not self.cameras:
+            raise InputError(f"--holdout-camera {holdout_cameras[0]}: {self.path} has point clouds and no cameras")
         for view in holdout_cameras:
             if not 0 <= view < len(self.cameras):
                 raise InputError(f"--holdout-camera {view}: the scene has cameras 0 to {len(self.cameras) - 1}")
         hidden = tuple(sorted({*self.hidden_views, *holdout_cameras}))
-        if len(hidden) >= len(self.cameras):
+        if self.cameras and len(hidden) >= len(self.cameras):
             raise InputError("--holdout-camera leaves no camera to train on")
         return replace(self, frame_count=count, hidden_views=hidden)

@@ -10,10 +10,12 @@ from masiv.scene.scene import Scene
 
 
 def conventions(scene: Scene) -> dict[str, Any]:
-    """Layout, time, axes, gravity, ground and density of a scene, as plain values."""
+    """Layout, time, axes, gravity, ground, density and noise of depth of a scene, as plain values."""
     ground = None
     if scene.ground is not None:
         ground = {"normal": scene.ground.normal.tolist(), "height_m": float(scene.ground.height)}
+    noise = scene.depth_noise
+    depth = {} if noise is None else {"depth_noise": {"constant_m": noise.constant, "quadratic_1_m": noise.quadratic}}
     return {
         "layout": scene.layout,
         "fps": float(scene.fps),
@@ -24,6 +26,7 @@ def conventions(scene: Scene) -> dict[str, Any]:
         "ground": ground,
         "density_kg_m3": float(scene.density),
         "mask_source": scene.mask_source,
+        **depth,
         **_shutters(scene),
     }
 
@@ -44,14 +47,19 @@ def summarise(scene: Scene) -> dict[str, Any]:
 
     ``consistency_px`` of the cameras is not known here.
     """
+    if scene.load_cloud is not None:
+        return _summarise_clouds(scene)
     problems = list(scene.problems)
     coverage = np.zeros((len(scene.views), scene.frame_count))
     seen = np.zeros(coverage.shape, bool)
+    known: list[float] = []
     for row, view in enumerate(scene.views):
         for frame in range(scene.frame_count):
             picture = scene.frame(view, frame)
             seen[row, frame] = picture.valid.any()
             coverage[row, frame] = picture.mask.mean()
+            if picture.depth is not None and coverage[row, frame] > 0:
+                known.append(float((picture.depth[picture.mask > 0.5] > 0).mean()))
             if seen[row, frame] and coverage[row, frame] == 0:
                 problems.append(f"view {view} at frame {frame}: the mask is empty")
             elif coverage[row, frame] > 0.6:
@@ -66,6 +74,7 @@ def summarise(scene: Scene) -> dict[str, Any]:
         "duration_s": (scene.frame_count - 1) / scene.fps,
         "fit_frames": scene.fit_frames,
         "mask_coverage": {"mean": coverage.mean(), "min": coverage.min(), "max": coverage.max()},
+        **({"depth_coverage": {"mean": float(np.mean(known)), "min": min(known)}} if known else {}),
         "cameras": [
             {
                 "name": camera.name,
@@ -83,6 +92,21 @@ def summarise(scene: Scene) -> dict[str, Any]:
     }
 
 
+def _summarise_clouds(scene: Scene) -> dict[str, Any]:
+    counts = [len(scene.cloud(frame).points) for frame in range(scene.frame_count)]
+    first = scene.cloud(0)
+    return {
+        "scene": str(scene.path),
+        **conventions(scene),
+        "duration_s": (scene.frame_count - 1) / scene.fps,
+        "fit_frames": scene.fit_frames,
+        "points": {"mean": float(np.mean(counts)), "min": min(counts), "max": max(counts)},
+        "box_m": [first.points.min(axis=0).tolist(), first.points.max(axis=0).tolist()],
+        "cameras": [],
+        "problems": list(scene.problems),
+    }
+
+
 def as_text(summary: dict[str, Any]) -> str:
     """The result of ``summarise`` as text."""
 
@@ -91,17 +115,32 @@ def as_text(summary: dict[str, Any]) -> str:
 
     ground = summary["ground"]
     plane = "none" if ground is None else f"normal {numbers(ground['normal'])}, height {ground['height_m']:.4g} m"
-    coverage = summary["mask_coverage"]
     lines = [
         f"{summary['scene']}: {summary['layout']} layout",
         f"frames   {summary['frames']} at {summary['fps']:.6g} fps, {summary['duration_s']:.3f} s",
         f"units    metres, seconds; up {numbers(summary['up'])}; gravity {numbers(summary['gravity_m_s2'])} m/s²",
         f"ground   {plane}",
         f"density  {summary['density_kg_m3']:.6g} kg/m³",
-        f"masks    {summary['mask_source']}; cover {coverage['mean']:.1%} of a picture "
-        f"({coverage['min']:.1%} to {coverage['max']:.1%})",
-        f"cameras  {summary['views']}",
     ]
+    if "points" in summary:
+        points, (low, high) = summary["points"], summary["box_m"]
+        lines += [
+            f"points   {points['mean']:.0f} a frame ({points['min']} to {points['max']}); "
+            f"frame 0 from {numbers(low)} to {numbers(high)} m"
+        ]
+    else:
+        coverage = summary["mask_coverage"]
+        lines += [
+            f"masks    {summary['mask_source']}; cover {coverage['mean']:.1%} of a picture "
+            f"({coverage['min']:.1%} to {coverage['max']:.1%})"
+        ]
+    if "depth_coverage" in summary:
+        known, noise = summary["depth_coverage"], summary["depth_noise"]
+        lines += [
+            f"depth    known in {known['mean']:.1%} of the object's pixels ({known['min']:.1%} at least); standard "
+            f"deviation {1e3 * noise['constant_m']:.3g} mm + {1e3 * noise['quadratic_1_m']:.3g} mm/m² z²"
+        ]
+    lines += [f"cameras  {summary['views']}"]
     for key, name in (("exposure_time_s", "exposure"), ("readout_time_s", "readout ")):
         if key in summary:
             lines.append(f"{name} " + ", ".join(f"{1e3 * time:.3g}" for time in summary[key]) + " ms")

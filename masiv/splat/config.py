@@ -77,6 +77,12 @@ class ReconstructConfig(BaseModel):
 
     ssim_weight: float = Field(0.2, ge=0, le=1, description="of 1 - SSIM; L1 has one minus this weight")
     alpha_weight: float = Field(0.5, ge=0, description="of the difference between alpha and mask")
+    depth_weight: float = Field(
+        0.3, ge=0, description="of the rendered depth's distance to the measured one, over the object's half-extent"
+    )
+    cloud_weight: float = Field(
+        1.0, ge=0, description="of the distance to a frame's point cloud, over the object's half-extent"
+    )
     scale_weight: float = Field(0.002, ge=0, description="of the mean scale over its initial value")
     rigidity_weight: float = Field(0.3, ge=0, description="of squared strain between neighbours")
     hull_weight: float = Field(0.3, ge=0, description="of the distance to a frame's hull; decays to zero")

@@ -20,6 +20,7 @@ from masiv.hull.velocity import with_velocities
 from masiv.progress import Progress, silent
 from masiv.scene.gaps import interpolated
 from masiv.scene.scene import Scene
+from masiv.splat.clouds import centroid, cloud_objective
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
@@ -98,41 +99,15 @@ class _ExtensionFit:
             )
         new = range(self.known, self.count)
         self.iterations = math.ceil(extension.step_ratio * config.iterations / self.known * len(new))
-        self.observed = [frame for frame in scene.observed_frames if frame >= self.known]
-        if not self.observed:
-            raise InputError(f"{scene.path} has no picture of a frame from {self.known} on")
-        self.images = dict(zip(self.observed, observed_images(scene, config, self.observed), strict=True))
-        progress("extend frames", 0, self.iterations, "carving hulls")
-        last = max(frame for frame in scene.observed_frames if frame < self.known)
-        frames = [last, *self.observed]
-        scene = with_velocities(scene)
-        first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
-        hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
-
         means = dynamic.canonical.means.detach()
         self.gaussians = _parameters(dynamic.canonical)
         self.pairs = neighbour_pairs(means.double().numpy(), config.neighbours)
         self.half_extent = known.settings["half_extent"]
-        cache = TreeCache()
-        hull_losses = {frame: HullLoss(hull, cache) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
-        scale = float(dynamic.canonical.scales.mean())
-        self.objective = Objective(
-            config,
-            scale,
-            self.half_extent,
-            scene.fps,
-            scene.ground,
-            hull_losses,
-            self.images,
-            scene.view_time_offsets,
-        )
+        centroids = self._observe(scene, float(dynamic.canonical.scales.mean()), progress)
 
         self.known_times = torch.arange(self.known) / scene.fps
         with torch.no_grad():
             self.known_changes = known.changes(means, self.known_times)
-        centroids = np.stack([h.points.mean(axis=0) for h in hulls])
-        centroids = interpolated([frame - last for frame in frames], centroids, self.count - last)
-        centroids = torch.tensor(centroids[self.known - 1 - last :], dtype=torch.float32)
         settings = (config.model_dump(exclude={"processes"}), extension.model_dump())
         self.identity = repr((*settings, seed, str(scene.path), self.known, self.count, scene.views))
         resumed = state is not None and state["identity"] == self.identity
@@ -141,6 +116,43 @@ class _ExtensionFit:
             self.iteration = state["iteration"]
             self.network.load_state_dict(state["network"])
             self.optimiser.load_state_dict(state["optimiser"])
+
+    def _observe(self, scene: Scene, scale: float, progress: Progress) -> torch.Tensor:
+        """Set the objective and the ``images`` of the ``observed`` new frames.
+
+        Returns centroids (K, 3) [m] from the last known frame on, interpolated at frames without a picture.
+        """
+        config = self.config
+        self.observed = [frame for frame in scene.observed_frames if frame >= self.known]
+        if not self.observed:
+            raise InputError(f"{scene.path} has no picture of a frame from {self.known} on")
+        last = max(frame for frame in scene.observed_frames if frame < self.known)
+        frames = [last, *self.observed]
+        if scene.load_cloud is not None:
+            self.objective = cloud_objective(scene, config, self.observed, config.gaussians, scale, self.half_extent)
+            self.images = {frame: self.objective.images[frame] for frame in self.observed}
+            centroids = np.stack([centroid(scene.cloud(frame).points) for frame in frames])
+        else:
+            self.images = dict(zip(self.observed, observed_images(scene, config, self.observed), strict=True))
+            progress("extend frames", 0, self.iterations, "carving hulls")
+            scene = with_velocities(scene)
+            first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
+            hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
+            cache = TreeCache()
+            losses = {frame: HullLoss(hull, cache) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
+            self.objective = Objective(
+                config,
+                scale,
+                self.half_extent,
+                scene.fps,
+                scene.ground,
+                losses,
+                self.images,
+                scene.view_time_offsets,
+            )
+            centroids = np.stack([h.points.mean(axis=0) for h in hulls])
+        centroids = interpolated([frame - last for frame in frames], centroids, self.count - last)
+        return torch.tensor(centroids[self.known - 1 - last :], dtype=torch.float32)
 
     def _begin(self, known: DeformationNetwork, centroids: torch.Tensor, *, pretrain: bool) -> None:
         """A network of all frames. ``centroids`` of the hulls, from the last known frame on, extend the base motion."""

@@ -118,6 +118,10 @@ class Corrections:
         stretched = (depth + moved[:, 2]) * torch.exp(-c[6]) - depth
         return positions + torch.cat([moved[:, :2], stretched[:, None]], dim=1) @ rotation
 
+    def depth(self, view: int, depth: torch.Tensor) -> torch.Tensor:
+        """A rendered depth [m] of ``positions``, as it is before the focal length that stands in it."""
+        return depth * torch.exp(self.cameras[view, 6])
+
     def rgb(
         self, view: int, frame: int, rgb: torch.Tensor, alpha: torch.Tensor, background: torch.Tensor
     ) -> torch.Tensor:

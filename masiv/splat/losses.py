@@ -1,4 +1,4 @@
-"""Terms of the reconstruction loss: SSIM of small images, and strain between neighbours."""
+"""Terms of the reconstruction loss: SSIM of small images, distance of depths, and strain between neighbours."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from functools import lru_cache
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+
+from masiv.splat.observed_image import ObservedDepth
 
 _WINDOW, _SIGMA = 11, 1.5
 _C1, _C2 = 0.01**2, 0.03**2
@@ -27,6 +29,22 @@ def ssim(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     luminance = (2 * both + _C1) / (means + _C1)
     structure = (2 * (product - both) + _C2) / (square1 + square2 - means + _C2)
     return (luminance * structure).mean()
+
+
+def depth_distance(depth: torch.Tensor, alpha: torch.Tensor, observed: ObservedDepth) -> torch.Tensor:
+    """Distance [m] of rendered ``depth`` (H, W) [m] to the observed one, a scalar; 0 if they share no pixel.
+
+    Huber's loss (Huber 1964) that turns from a square to a distance at one standard deviation σ of the measurement, so
+    that noise has little weight and an outlier no more than its distance:
+
+        |e| < σ: e² / 2σ,  else |e| - σ/2.
+
+    The mean is weighted by 1/σ. Pixels that the Gaussians cover by half or less have no depth to compare.
+    """
+    weight = observed.known / observed.noise * (alpha.detach() > 0.5)
+    error = (depth - observed.values).abs()
+    huber = torch.where(error < observed.noise, error.square() / (2 * observed.noise), error - 0.5 * observed.noise)
+    return (weight * huber).sum() / weight.sum().clamp(min=1e-6)
 
 
 @lru_cache(maxsize=256)

@@ -13,7 +13,7 @@ from masiv.splat.config import ReconstructConfig
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.hull_loss import HullLoss
 from masiv.splat.image_formation import Corrections, ImageFormation
-from masiv.splat.losses import Pairs, ssim, strain
+from masiv.splat.losses import Pairs, depth_distance, ssim, strain
 from masiv.splat.observed_image import ObservedImage
 from masiv.splat.rasteriser import render
 from masiv.splat.shutter import expose, velocities
@@ -156,17 +156,21 @@ class Objective:
                 positions = corrected.positions(observed.view, positions)
             if observed.camera.shutter.is_instant:
                 drawn = render(observed.camera, positions, scales, opacities, colours, background)
-                rgb, alpha = drawn.rgb, drawn.alpha
             else:
                 velocity = velocities(network, means.detach(), float(moments.times[k].detach()), observed.camera)
                 if corrected is not None:  # the corrections are an affine map
                     ahead = corrected.positions(observed.view, means + displacements[k] + velocity)
                     velocity = ahead - positions
-                rgb, alpha = expose(observed.camera, positions, velocity, scales, opacities, colours, background)
+                drawn = expose(observed.camera, positions, velocity, scales, opacities, colours, background)
+            rgb = drawn.rgb
             if corrected is not None:
-                rgb = corrected.rgb(observed.view, frame, rgb, alpha, background)
-            image_losses.append(self._image_loss(rgb, alpha, observed, background))
+                rgb = corrected.rgb(observed.view, frame, rgb, drawn.alpha, background)
+            image_losses.append(self._image_loss(rgb, drawn.alpha, observed, background))
             loss = loss + image_losses[-1] / part.image_count
+            if observed.depth is not None and c.depth_weight > 0:
+                depth = drawn.depth if corrected is None else corrected.depth(observed.view, drawn.depth)
+                distance = depth_distance(depth, drawn.alpha, observed.depth)
+                loss = loss + c.depth_weight * distance / (self.half_extent * part.image_count)
         if part.scale_term and formation is not None and corrected is not None:
             level = torch.stack(image_losses).detach().mean()
             loss = loss + level * formation.prior_weight * corrected.penalty()

@@ -10,7 +10,7 @@ from typing import overload
 import numpy as np
 import torch
 
-from masiv.array_file import ArrayFile
+from masiv.array_file import ArrayFile, StoredArray
 from masiv.errors import MasivError
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
@@ -18,11 +18,25 @@ from masiv.splat.config import ReconstructConfig
 
 
 @dataclass(frozen=True)
+class ObservedDepth:
+    """Depth of the object along the optical axis; float32 tensors.
+
+    values (H, W) [m], and their standard deviation ``noise`` (H, W) [m]; known (H, W): 1 where the whole pixel is on
+    the object and measured, else 0.
+    """
+
+    values: torch.Tensor
+    noise: torch.Tensor
+    known: torch.Tensor
+
+
+@dataclass(frozen=True)
 class ObservedImage:
     """One image of the object; float32 tensors.
 
     view: index of the camera among those that are fitted. camera: of the crop. colour (H, W, 3) in [0, 1], multiplied
-    by the mask. mask (H, W) in [0, 1]. valid (H, W): the fraction of a pixel that no occluder hides.
+    by the mask. mask (H, W) in [0, 1]. valid (H, W): the fraction of a pixel that no occluder hides. depth:
+    measured depth of the object, if the recording has any.
     """
 
     view: int
@@ -30,6 +44,7 @@ class ObservedImage:
     colour: torch.Tensor
     mask: torch.Tensor
     valid: torch.Tensor
+    depth: ObservedDepth | None = None
 
 
 class StoredImages(Sequence[ObservedImage]):
@@ -38,7 +53,12 @@ class StoredImages(Sequence[ObservedImage]):
     def __init__(self, file: ArrayFile, images: Iterable[ObservedImage]) -> None:
         self._file = file
         self._images = [
-            (image.view, image.camera, [file.append(t.numpy()) for t in (image.colour, image.mask, image.valid)])
+            (
+                image.view,
+                image.camera,
+                [file.append(t.numpy()) for t in (image.colour, image.mask, image.valid)],
+                None if (d := image.depth) is None else [file.append(t.numpy()) for t in (d.values, d.noise, d.known)],
+            )
             for image in images
         ]
 
@@ -52,8 +72,13 @@ class StoredImages(Sequence[ObservedImage]):
     def __getitem__(self, index: int | slice) -> ObservedImage | list[ObservedImage]:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
-        view, camera, stored = self._images[index]
-        return ObservedImage(view, camera, *(torch.from_numpy(self._file.read(array)) for array in stored))
+        view, camera, stored, depth = self._images[index]
+        return ObservedImage(
+            view, camera, *self._read(stored), None if depth is None else ObservedDepth(*self._read(depth))
+        )
+
+    def _read(self, stored: list[StoredArray]) -> list[torch.Tensor]:
+        return [torch.from_numpy(self._file.read(array)) for array in stored]
 
 
 def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[StoredImages]:
@@ -100,7 +125,20 @@ def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_
         torch.from_numpy(_average(colour, factor) / divisor[..., None]),
         torch.from_numpy(_average(mask, factor) / divisor),
         torch.from_numpy(visible),
+        None if picture.depth is None else _observed_depth(scene, picture.depth[window], mask, factor),
     )
+
+
+def _observed_depth(scene: Scene, depth: np.ndarray, mask: np.ndarray, factor: int) -> ObservedDepth | None:
+    """Depth (H, W) [m] of the crop, averaged down; None if no pixel is on the object and measured as a whole."""
+    known = _average(((depth > 0) & (mask > 0.99)).astype(np.float32), factor) > 1 - 1e-6
+    if scene.depth_noise is None or not known.any():
+        return None
+    values = np.where(known, _average(depth, factor), np.float32(0))
+    noise = scene.depth_noise.std(values)
+    # Not divided by the factor: errors of neighbouring pixels of a depth camera are correlated.
+    arrays = values, noise.astype(np.float32), known.astype(np.float32)
+    return ObservedDepth(*(torch.from_numpy(np.ascontiguousarray(array)) for array in arrays))
 
 
 def _span(indices: np.ndarray, padding: int, factor: int, limit: int) -> tuple[int, int]:

@@ -16,6 +16,7 @@ from masiv.progress import Progress
 from masiv.scene.calibration import Calibration
 from masiv.scene.gaps import interpolated
 from masiv.scene.scene import Scene
+from masiv.splat.clouds import cloud_objective, for_clouds, initial_from_clouds
 from masiv.splat.config import ReconstructConfig
 from masiv.splat.data_parallel import GradientWorker, Networks, gradients, parameters
 from masiv.splat.deformation import DeformationNetwork
@@ -40,6 +41,7 @@ def reconstruct(
     """Fit Gaussians at frame 0 and their motion to all frames of ``scene``; held-out views are not used.
 
     Frames are added one after the other. Each starts from the extrapolated motion, so that material points are tracked.
+    Of point clouds, the Gaussians are points of the first one and the motion registers them to the others.
     Needs ``masiv.runtime.start``. Raises MasivError if a frame does not show the object or the fit diverges.
     The last state stays in ``checkpoint``: clear it after the result is saved.
     """
@@ -69,16 +71,39 @@ class _Fit:
         progress: Progress,
         worker: GradientWorker | None = None,
     ) -> None:
-        self.config, self.seed, self.scene, self.worker = config, seed, scene, worker
-        self.images = observed_images(scene, config, range(scene.frame_count))
+        self.config = config if scene.load_cloud is None else for_clouds(config)
+        self.seed, self.scene, self.worker = seed, scene, worker
         self.identity = repr(
             (config.model_dump(exclude={"processes"}), seed, str(scene.path), scene.frame_count, scene.views)
         )
         shutters = [scene.cameras[view].shutter for view in scene.views]
         self.identity += "" if all(s.is_instant for s in shutters) else repr(shutters)
-        progress("reconstruct", 0, config.iterations, "carving hulls")
-        initial = initial_gaussians(scene, config.gaussians, config.hull_resolution, np.random.default_rng((seed, 0)))
+        initial = self._observe(progress)
         self.half_extent = initial.half_extent
+        self.formation = self._image_formation(initial) if self.config.refine_calibration else None
+        if state is not None and state["identity"] == self.identity:
+            self._resume(state)
+        else:
+            self._begin(initial)
+        if worker is not None:
+            worker.configure(self.objective, self.networks, len(self.parameters["means"]))
+
+    def _observe(self, progress: Progress) -> InitialGaussians:
+        """Set the objective, ``images`` by frame and their number; returns the start of the fit."""
+        scene, config = self.scene, self.config
+        if scene.load_cloud is not None:
+            progress("reconstruct", 0, config.iterations, "reading point clouds")
+            initial = initial_from_clouds(scene, config.gaussians)
+            self.objective = cloud_objective(
+                scene, config, range(scene.frame_count), config.gaussians, initial.scale, initial.half_extent
+            )
+            self.images = [self.objective.images[frame] for frame in range(scene.frame_count)]
+            return initial
+        self.images = observed_images(scene, config, range(scene.frame_count))
+        progress("reconstruct", 0, config.iterations, "carving hulls")
+        initial = initial_gaussians(
+            scene, config.gaussians, config.hull_resolution, np.random.default_rng((self.seed, 0))
+        )
         cache = TreeCache()
         hulls = {frame: HullLoss(hull, cache) for frame, hull in zip(initial.frames, initial.hulls, strict=True)}
         self.objective = Objective(
@@ -91,13 +116,7 @@ class _Fit:
             self.images,
             scene.view_time_offsets,
         )
-        self.formation = self._image_formation(initial) if config.refine_calibration else None
-        if state is not None and state["identity"] == self.identity:
-            self._resume(state)
-        else:
-            self._begin(initial)
-        if worker is not None:
-            worker.configure(self.objective, self.networks, len(self.parameters["means"]))
+        return initial
 
     def _begin(self, initial: InitialGaussians) -> None:
         self.iteration = 0
@@ -300,7 +319,7 @@ class _Fit:
         for group, name in zip(self.optimiser.param_groups, PARAMETER_NAMES, strict=False):
             old = self.parameters[name]
             new = old.detach()[keep].clone().requires_grad_()
-            moments = self.optimiser.state.pop(old)
+            moments = self.optimiser.state.pop(old, {})  # none if the objective does not depend on it
             self.optimiser.state[new] = {k: v[keep] if v.shape == old.shape else v for k, v in moments.items()}
             group["params"] = [new]
             self.parameters[name] = new

@@ -8,7 +8,7 @@ import torch
 
 from masiv.scene.camera import Camera
 from masiv.splat.deformation import DeformationNetwork
-from masiv.splat.rasteriser import render
+from masiv.splat.rasteriser import Rendering, render
 
 SAMPLE_STEP = 1.0  # pixels
 """Motion between two samples of an exposure, at most, unless ``MAX_SAMPLES`` is reached. Of the error of an image
@@ -40,8 +40,8 @@ def expose(
     opacities: torch.Tensor,
     colours: torch.Tensor,
     background: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """rgb (H, W, 3) and alpha (H, W) of Gaussians that are at ``means`` (N, 3) [m] at the frame's time.
+) -> Rendering:
+    """Of Gaussians that are at ``means`` (N, 3) [m] at the frame's time.
 
     The mean of renders that are spread over the exposure time. In each of them a Gaussian is where it is when its row
     is read, x + v (t_row + t_sample): ``velocity`` (N, 3) [m/s] is taken as constant over the exposure of one image.
@@ -51,8 +51,10 @@ def expose(
     for k in range(count):
         sample = camera.shutter.exposure_time * ((k + 0.5) / count - 0.5)
         drawn.append(render(camera, at_row(camera, means, velocity, sample), scales, opacities, colours, background))
-    rgb, alpha = sum(one.rgb for one in drawn), sum(one.alpha for one in drawn)
-    return torch.as_tensor(rgb) / count, torch.as_tensor(alpha) / count
+    rgb, alpha = (torch.as_tensor(sum(parts)) for parts in ([d.rgb for d in drawn], [d.alpha for d in drawn]))
+    depth = torch.as_tensor(sum(one.alpha * one.depth for one in drawn))
+    depth = torch.where(alpha > 0, depth / torch.where(alpha > 0, alpha, 1.0), 0.0)
+    return Rendering(rgb / count, alpha / count, depth)
 
 
 def at_row(camera: Camera, means: torch.Tensor, velocity: torch.Tensor, sample: float) -> torch.Tensor:
