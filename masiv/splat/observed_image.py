@@ -10,7 +10,7 @@ from typing import overload
 import numpy as np
 import torch
 
-from masiv.array_file import ArrayFile
+from masiv.array_file import ArrayFile, StoredArray
 from masiv.errors import MasivError
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
@@ -53,7 +53,12 @@ class StoredImages(Sequence[ObservedImage]):
     def __init__(self, file: ArrayFile, images: Iterable[ObservedImage]) -> None:
         self._file = file
         self._images = [
-            (image.view, image.camera, [file.append(t.numpy()) for t in (image.colour, image.mask, image.valid)])
+            (
+                image.view,
+                image.camera,
+                [file.append(t.numpy()) for t in (image.colour, image.mask, image.valid)],
+                None if (d := image.depth) is None else [file.append(t.numpy()) for t in (d.values, d.noise, d.known)],
+            )
             for image in images
         ]
 
@@ -67,8 +72,13 @@ class StoredImages(Sequence[ObservedImage]):
     def __getitem__(self, index: int | slice) -> ObservedImage | list[ObservedImage]:
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
-        view, camera, stored = self._images[index]
-        return ObservedImage(view, camera, *(torch.from_numpy(self._file.read(array)) for array in stored))
+        view, camera, stored, depth = self._images[index]
+        return ObservedImage(
+            view, camera, *self._read(stored), None if depth is None else ObservedDepth(*self._read(depth))
+        )
+
+    def _read(self, stored: list[StoredArray]) -> list[torch.Tensor]:
+        return [torch.from_numpy(self._file.read(array)) for array in stored]
 
 
 def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[StoredImages]:
