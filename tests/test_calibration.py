@@ -14,6 +14,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.progress import silent
 from masiv.scene.calibration import NO_CORRECTION, Calibration, CameraCorrection, corrected_camera
+from masiv.scene.shutter import Shutter
 from masiv.splat.config import CalibrationConfig
 from masiv.splat.image_formation import ImageFormation, displacement_jacobian, rotate
 from masiv.splat.objective import Objective, Part
@@ -184,7 +185,14 @@ def test_the_gradient_of_the_image_loss_is_that_of_finite_differences():
     with torch.no_grad():
         made.pose.mul_(0.3)
     pairs = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long)
-    part = Part(((0, 0, np.full(3, 0.2)), (1, 0, np.full(3, 0.9))), 2, (), 2, None, scale_term=False)
+    part = Part(
+        ((0, objective.images[0][0], np.full(3, 0.2)), (1, objective.images[1][0], np.full(3, 0.9))),
+        2,
+        (),
+        2,
+        None,
+        scale_term=False,
+    )
 
     def loss():
         torch.set_default_dtype(torch.float64)
@@ -225,6 +233,8 @@ def test_calibration_round_trip_and_scenes_that_it_applies_to(tmp_path):
     assert again.time_offsets == made.time_offsets == (0, CORRECTION.time_offset, 0, 0, 0, 0, 0)
     assert again.displacement_px == made.displacement_px
     assert made.displacement_px[1] > 0.5
+    assert f"{made.displacement_px[1]:.2f} px for {scene.cameras[1].name}; clocks by 4.0 ms" in made.text()
+    assert made.summary()[1]["focal_factor"] == pytest.approx(np.exp(CORRECTION.log_focal))
     assert made.refined[3] is made.given[3]
     row = json.loads((tmp_path / "calibration.json").read_text())["cameras"][1]
     np.testing.assert_allclose(np.radians(row["rotation_deg"]), CORRECTION.rotation, atol=1e-9)
@@ -232,7 +242,14 @@ def test_calibration_round_trip_and_scenes_that_it_applies_to(tmp_path):
 
     refined = again.applied_to(scene)
     np.testing.assert_array_equal(refined.cameras[1].intrinsics, made.refined[1].intrinsics)
-    assert again.applied_to(refined).cameras == refined.cameras
+    twice = again.applied_to(refined)
+    np.testing.assert_array_equal(twice.cameras[1].world_to_camera, refined.cameras[1].world_to_camera)
+    assert twice.time_offsets == refined.time_offsets == made.time_offsets
+    slow = Shutter.of_image(0.01, 0.02, scene.cameras[1].height)
+    rolling = dataclasses.replace(
+        scene, cameras=tuple(dataclasses.replace(camera, shutter=slow) for camera in scene.cameras)
+    )
+    assert again.applied_to(rolling).cameras[1].shutter == slow
     other = dataclasses.replace(scene, cameras=scene.cameras[::-1])
     with pytest.raises(InputError, match="not those that were refined"):
         again.applied_to(other)

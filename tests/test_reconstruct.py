@@ -221,16 +221,16 @@ def test_the_second_process_keeps_the_module_path_of_this_one(monkeypatch):
 
 
 def test_what_the_second_process_cannot_draw_is_told_of(scene):
-    """Its objective alone is broken: the picture that it is given has a camera of no number."""
+    """The picture that it is given has a camera of no number."""
     nowhere = dataclasses.replace(scene.cameras[0], world_to_camera=np.full((4, 4), np.nan))
     seen = dataclasses.replace(observed_image(scene, 0, 0, crop_side=40, crop_padding=4), camera=nowhere)
-    objective = Objective(CONFIG, 0.01, 0.2, FPS, None, (), [[seen]])
+    objective = Objective(CONFIG, 0.01, 0.2, FPS, None, (), {})
     gaussians = {n: torch.zeros(4, *s) for n, s in zip(PARAMETER_NAMES, ((3,), (), (), (3,)), strict=True)}
     network = DeformationNetwork(
         centre=torch.zeros(3), half_extent=0.2, frame_count=2, fps=FPS, base_motion=torch.zeros(2, 3)
     )
     pairs = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.long)
-    part = Part(((0, 0, np.zeros(3)),), 1, (0,), 1, None, scale_term=True)
+    part = Part(((0, seen, np.zeros(3)),), 1, (0,), 1, None, scale_term=True)
     with GradientWorker() as worker:
         worker.configure(objective, Networks(network), 4)
         for _ in range(2):  # it goes on

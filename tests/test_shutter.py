@@ -195,10 +195,10 @@ def test_the_loss_of_reconstruct_is_least_with_the_right_shutter():
     losses = {}
     for frame in (0, 2):
         rgb, alpha = filmed(camera(BOTH), lambda time, f=frame: POINTS + VELOCITY * (time + f / FPS), 8)
-        part = Part(((frame, 0, np.full(3, 0.4)),), 1, (), 1, None, scale_term=False)
         for name, shutter in shutters.items():
             observed = ObservedImage(0, camera(shutter), rgb.float(), alpha.float(), torch.ones(SIDE, SIDE))
-            objective = Objective(ReconstructConfig(), 0.016, 0.25, FPS, None, {}, {frame: [observed]})
+            part = Part(((frame, observed, np.full(3, 0.4)),), 1, (), 1, None, scale_term=False)
+            objective = Objective(ReconstructConfig(), 0.016, 0.25, FPS, None, {}, {})
             losses[name] = float(objective.part(gaussians, network, pairs, part).detach())
         assert min(losses, key=lambda name: losses[name]) == "right", (frame, losses)
         assert losses["right"] < 0.5 * losses["none"], (frame, losses)

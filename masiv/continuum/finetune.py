@@ -141,7 +141,7 @@ class _TrajectoryLoss:
         first = 1 if known is None else len(known.displacements)
         self.known_times = torch.as_tensor(scene.times[:first], dtype=torch.float32)
         self.times = torch.as_tensor(scene.times[first:], dtype=torch.float32)
-        self.views = None if scene.load_cloud is not None else load_views(scene)[first:]
+        self.views = None if scene.load_cloud is not None else load_views(scene, first)
         opaque = dynamic.canonical.opacities.detach().reshape(-1) > 0.1
         self.anchors = dynamic.canonical.means.detach()[opaque]
         guide = dynamic.deformation if known is None else known.network
@@ -167,7 +167,7 @@ class _TrajectoryLoss:
         silhouette: dict[str, torch.Tensor] = {}
         if self.views is not None:
             outside = [
-                outside_of_mask(at_frame, views[rng.integers(len(views))])
+                outside_of_mask(at_frame, views[int(rng.integers(len(views)))])
                 for at_frame, views in zip(positions, self.views, strict=True)
             ]
             silhouette["silhouette"] = torch.stack(outside).square().mean() * square

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import overload
 
 import cv2
 import numpy as np
 import torch
 
+from masiv.array_file import ArrayFile
 from masiv.hull.silhouette import silhouettes
 from masiv.scene.scene import Ground, Scene
 from masiv.scene.shutter import INSTANT, Shutter
 
 _LARGEST_SIDE = 256
 """Pixels along the longer side of a distance field. Larger ones are reduced: signed distances are smooth."""
+_NOTHING = torch.zeros(0, 0)
 
 
 @dataclass(frozen=True)
@@ -32,9 +36,33 @@ class View:
     time_offset: float = 0.0
 
 
-def load_views(scene: Scene) -> list[list[View]]:
-    """The masks of all views that are not held out: a list over frames of lists over views."""
-    return [[_view(s) for s in silhouettes(scene, frame)] for frame in range(scene.frame_count)]
+class StoredViews(Sequence[View]):
+    """The masks of one frame. Their distances are in a file, and are read when a view is asked for."""
+
+    def __init__(self, file: ArrayFile, views: Iterable[View]) -> None:
+        self._file = file
+        self._views = [(replace(view, distance=_NOTHING), file.append(view.distance.numpy())) for view in views]
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @overload
+    def __getitem__(self, index: int) -> View: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[View]: ...
+    def __getitem__(self, index: int | slice) -> View | list[View]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        view, stored = self._views[index]
+        return replace(view, distance=torch.from_numpy(self._file.read(stored)))
+
+
+def load_views(scene: Scene, first: int = 0) -> list[StoredViews]:
+    """The masks of all views that are not held out, of each frame from ``first`` on. They are in one file."""
+    file = ArrayFile()
+    return [
+        StoredViews(file, (_view(s) for s in silhouettes(scene, frame))) for frame in range(first, scene.frame_count)
+    ]
 
 
 def _view(silhouette) -> View:

@@ -64,8 +64,11 @@ class VideoRun(Run):
             "reconstruction": numbers,
             "seconds": self.folder.seconds(),
         }
-        text = f"{self.path}: {len(dynamic.canonical)} Gaussians\n{table({'reconstruction': numbers})}"
-        return Summary(data, text)
+        text = f"{self.path}: {len(dynamic.canonical)} Gaussians\n"
+        if dynamic.calibration is not None:
+            data["calibration"] = dynamic.calibration.summary()
+            text += f"{dynamic.calibration.text()}\n"
+        return Summary(data, f"{text}{table({'reconstruction': numbers})}")
 
     def trajectory(self, progress: Progress = silent) -> Summary:
         made = stages.ensure_trajectory(self.folder, self.config, self.scene, progress)

@@ -51,7 +51,7 @@ def corrected_camera(camera: Camera, correction: CameraCorrection, pivot: np.nda
     pose[:3, 3] = rotation @ (given[:3, 3] - centre) + centre + correction.translation
     intrinsics = np.array(camera.intrinsics, np.float64)
     intrinsics[:2, :2] *= np.exp(correction.log_focal)
-    return Camera(camera.name, camera.width, camera.height, intrinsics, pose)
+    return replace(camera, intrinsics=intrinsics, world_to_camera=pose)
 
 
 @dataclass(frozen=True)
@@ -95,14 +95,38 @@ class Calibration:
 
         Raises InputError if its cameras are others than those that were refined.
         """
-        if scene.cameras is self.refined:
-            return scene
         for known in (self.given, self.refined):
             if len(known) == len(scene.cameras) and all(map(_same, known, scene.cameras)):
-                return replace(scene, cameras=self.refined, time_offsets=self.time_offsets)
+                cameras = tuple(
+                    replace(camera, intrinsics=new.intrinsics, world_to_camera=new.world_to_camera)
+                    for camera, new in zip(scene.cameras, self.refined, strict=True)
+                )
+                return replace(scene, cameras=cameras, time_offsets=self.time_offsets)
         raise InputError(
             f"{scene.path}: the cameras are not those that were refined ({len(self.given)} cameras): give the scene of "
             "the run, or reconstruct it anew"
+        )
+
+    def summary(self) -> list[dict[str, Any]]:
+        """A row for each camera: name, displacement_px, focal_factor, time_offset_s."""
+        rows = zip(self.given, self.refined, self.time_offsets, self.displacement_px, strict=True)
+        return [
+            {
+                "name": given.name,
+                "displacement_px": displacement,
+                "focal_factor": float(refined.intrinsics[0, 0] / given.intrinsics[0, 0]),
+                "time_offset_s": offset,
+            }
+            for given, refined, offset, displacement in rows
+        ]
+
+    def text(self) -> str:
+        """One sentence: by how much the cameras were corrected."""
+        largest = int(np.argmax(self.displacement_px))
+        rms = float(np.sqrt(np.mean(np.square(self.displacement_px))))
+        return (
+            f"cameras refined: {rms:.2f} px on average in their pictures, {self.displacement_px[largest]:.2f} px for "
+            f"{self.given[largest].name}; clocks by {1e3 * max(map(abs, self.time_offsets)):.1f} ms at most"
         )
 
     def save(self, folder: Path) -> None:
@@ -132,6 +156,7 @@ class Calibration:
 
 
 def _same(one: Camera, other: Camera) -> bool:
+    """But for the shutter, which scene.yaml says and no fit changes."""
     return (
         (one.name, one.width, one.height) == (other.name, other.width, other.height)
         and np.array_equal(one.intrinsics, other.intrinsics)

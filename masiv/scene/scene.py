@@ -39,11 +39,9 @@ class Scene:
     mask_source: where masks come from, for messages. masks_estimated: from colours, none was given.
     correct_masks: makes the masks of the views of one frame agree, see ``masiv.hull.consistent_masks``; None for masks
     that are given. hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences
-    for the user.
-    velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for silhouettes of
-    views that show other times than the frame's.
-    missing: (view, frame) of which there is no picture.
-    time_offsets [s]: of the cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset.
+    for the user. velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for
+    silhouettes of views that show other times than the frame's. time_offsets [s]: of the cameras' clocks, empty if all
+    are exact. A picture was taken at frame / fps + offset. missing: (view, frame) of which there is no picture.
     depth_noise: None if the pictures have no depth. ``load_cloud(frame)``: for a recording of point clouds, which has
     no cameras; ``cloud(frame)`` also checks that this scene contains it.
     """
@@ -90,11 +88,6 @@ class Scene:
         return tuple(v for v in range(len(self.cameras)) if v not in self.hidden_views)
 
     @property
-    def view_time_offsets(self) -> tuple[float, ...]:
-        """``time_offsets`` [s] of ``views``; empty if all clocks are exact."""
-        return tuple(self.time_offsets[view] for view in self.views) if any(self.time_offsets) else ()
-
-    @property
     def observed_frames(self) -> tuple[int, ...]:
         """Frames of which a camera that is not held out has a picture."""
         if not self.missing:
@@ -108,6 +101,11 @@ class Scene:
     def shows_other_times(self, view: int) -> bool:
         """Whether pixels of ``view`` show other times than that of their frame: rolling shutter, clock."""
         return self.cameras[view].shutter.readout_time != 0 or self.time_offset(view) != 0
+
+    @property
+    def view_time_offsets(self) -> tuple[float, ...]:
+        """``time_offsets`` [s] of ``views``; empty if all clocks are exact."""
+        return tuple(self.time_offsets[view] for view in self.views) if any(self.time_offsets) else ()
 
     def frame(self, view: int, frame: int) -> Frame:
         """The picture of ``view`` at ``frame``; ``valid`` is False everywhere if there is none.

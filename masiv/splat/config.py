@@ -15,14 +15,12 @@ class CalibrationConfig(BaseModel):
         0.003, gt=0, description="of a camera's place, as a fraction of its distance to the object"
     )
     focal_fraction: float = Field(0.005, gt=0, description="of a camera's focal length, as a fraction")
-    time_frames: float = Field(0.5, gt=0, description="of a camera's clock [frames]")
+    time_frames: float = Field(
+        0.3, gt=0, description="of a camera's clock [frames]; 0.3 is that of cameras aligned to the nearest frame"
+    )
     log_gain: float = Field(0.05, gt=0, description="of the logarithm of an image's gain, for each colour channel")
     offset: float = Field(0.01, gt=0, description="of an image's offset, as a fraction of white")
     rate_px: float = Field(0.01, gt=0, description="initial learning rate of cameras [pixels]")
-    growth_rate_factor: float = Field(
-        0.1, ge=0, le=1, description="factor of the cameras' rate while frames are added: motion that is not found yet "
-        "would be explained by cameras",
-    )  # fmt: skip
     exposure_rate: float = Field(0.02, gt=0, description="initial learning rate of exposures, in steps of 2 % of white")
     start_fraction: float = Field(
         0.06, ge=0, lt=1, description="fraction of the steps after which cameras are refined; before, the first frame "

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -113,7 +113,8 @@ class GradientWorker:
         size = 8 * count + sum(p.numel() for p in networks.parameters())
         self._file.truncate(2 * 4 * size)
         self._values, self._gradients = _mapped(self._file.fileno(), size)
-        self._send((objective, networks, size))
+        # Each part brings its images.
+        self._send((replace(objective, images={}), networks, size))
 
     def submit(
         self, gaussians: dict[str, torch.Tensor], networks: Networks, pairs: Pairs, part: Part, *, corrected: bool

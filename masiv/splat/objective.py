@@ -28,14 +28,14 @@ HULL_SAMPLES = 700
 class Part:
     """A part of the loss of one step, with its random numbers drawn.
 
-    images: (frame, index of its image, background (3,)), frames ascending; image_count: images of the whole step.
+    images: (frame, image, background (3,)), frames ascending; image_count: images of the whole step.
     regularized: frames whose strain and ground terms this part contains; frame_count: frames of the whole step.
     hull: Gaussians and surface points that are compared with the hull of the last frame, and the weight of the term.
     scale_term: whether this part contains the terms that belong to no image: mean scale, prior of the cameras.
     moving: whether the step has a frame after the first. A clock that is off shows there only.
     """
 
-    images: tuple[tuple[int, int, np.ndarray], ...]
+    images: tuple[tuple[int, ObservedImage, np.ndarray], ...]
     image_count: int
     regularized: tuple[int, ...]
     frame_count: int
@@ -71,7 +71,7 @@ class Objective:
     fps: float
     ground: Ground | None
     hulls: Sequence[HullLoss] | Mapping[int, HullLoss]
-    images: Sequence[list[ObservedImage]] | Mapping[int, list[ObservedImage]]
+    images: Sequence[Sequence[ObservedImage]] | Mapping[int, Sequence[ObservedImage]]
     time_offsets: tuple[float, ...] = ()
 
     def __call__(
@@ -100,7 +100,8 @@ class Objective:
         moving = last > 0
         weight = self.config.hull_weight * hull_factor
         hull = (*self.hulls[last].draw(count, HULL_SAMPLES, rng), weight) if last > 0 and weight > 0 else None
-        drawn = sorted(((*image, rng.random(3)) for image in chosen), key=lambda image: image[0])
+        drawn = ((frame, self.images[frame][index], rng.random(3)) for frame, index in chosen)
+        drawn = sorted(drawn, key=lambda image: image[0])
         cut = len(drawn) - len(drawn) // 2
         frames = {frame for frame, *_ in drawn}
         later = {frame for frame, *_ in drawn[cut:]}
@@ -147,8 +148,7 @@ class Objective:
             displacements, log_changes = network.changes(means.detach(), moments.times)
             loss = loss + self._regularization(means.detach(), displacements, moments, pairs, part)
         image_losses = []
-        for (frame, index, drawn_background), k in zip(part.images, moments.of_image, strict=True):
-            observed = self.images[frame][index]
+        for (frame, observed, drawn_background), k in zip(part.images, moments.of_image, strict=True):
             background = torch.tensor(drawn_background, dtype=torch.float32)
             scales = (gaussians["log_scales"] + log_changes[k]).exp()
             positions = means + displacements[k]
@@ -184,7 +184,7 @@ class Objective:
             of_image = [frames.index(frame) for frame in in_images]
             of_frame = {frame: row for row, frame in enumerate(frames)}
             return Moments(torch.tensor(frames) / self.fps, of_image, of_frame, moving=frames[-1] > 0)
-        views = [self.images[frame][index].view for frame, index, _ in part.images]
+        views = [image.view for _, image, _ in part.images]
         of_frame = {frame: in_images.index(frame) for frame in frames}
         times = torch.tensor(in_images) / self.fps
         if self.time_offsets:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import numpy as np
 import torch
 
+from masiv.array_file import ArrayFile
 from masiv.errors import MasivError
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
@@ -45,18 +47,42 @@ class ObservedImage:
     depth: ObservedDepth | None = None
 
 
-def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[list[ObservedImage]]:
-    """The images of each of ``frames`` that show the object; none for a frame without pictures.
+class StoredImages(Sequence[ObservedImage]):
+    """The images of one frame. Their pixels are in a file, and are read when an image is asked for."""
+
+    def __init__(self, file: ArrayFile, images: Iterable[ObservedImage]) -> None:
+        self._file = file
+        self._images = [
+            (image.view, image.camera, [file.append(t.numpy()) for t in (image.colour, image.mask, image.valid)])
+            for image in images
+        ]
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    @overload
+    def __getitem__(self, index: int) -> ObservedImage: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[ObservedImage]: ...
+    def __getitem__(self, index: int | slice) -> ObservedImage | list[ObservedImage]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        view, camera, stored = self._images[index]
+        return ObservedImage(view, camera, *(torch.from_numpy(self._file.read(array)) for array in stored))
+
+
+def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[StoredImages]:
+    """The images of each of ``frames`` that show the object; none for a frame without pictures. They are in one file.
 
     Raises MasivError if there are pictures of a frame, but none shows the object.
     """
-    found, observed = [], set(scene.observed_frames)
+    found, observed, file = [], set(scene.observed_frames), ArrayFile()
     for frame in frames:
         of_frame = [
             observed_image(scene, view, frame, crop_side=config.crop_side, crop_padding=config.crop_padding)
             for view in scene.views
         ]
-        found.append([image for image in of_frame if image is not None])
+        found.append(StoredImages(file, (image for image in of_frame if image is not None)))
         if not found[-1] and frame in observed:
             raise MasivError(f"frame {frame} of {scene.path}: no view shows the object; check its masks")
     return found

@@ -255,8 +255,6 @@ class _Fit:
             for group in self.optimiser.param_groups:
                 if group["name"] == "means" or (group["name"] == "colour_logits" and self.annealing == 0):
                     group["lr"] *= c.canonical_rate_factor
-                if group["name"] == "cameras" and self.annealing == 0:
-                    group["lr"] *= c.calibration.growth_rate_factor
         parts = self.objective.parts(len(self.parameters["means"]), chosen, 1 - self.annealing, rng)
         value = self._compute_gradients(parts)
         if not np.isfinite(value):
