@@ -26,8 +26,9 @@ from masiv.observations.read import read_scene
 from masiv.scene.depth import back_projected, read_depth
 from masiv.scene.depth_masks import from_empty_depth
 from masiv.scene.summary import as_text, summarise
+from masiv.splat.config import ReconstructConfig
 from masiv.splat.losses import depth_distance
-from masiv.splat.observed_image import ObservedDepth, observed_image
+from masiv.splat.observed_image import ObservedDepth, observed_image, observed_images
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
 DEPTH_FRAME = 700  # millimetres at pixel (0, 0) of a picture, one more a column
@@ -359,7 +360,6 @@ def test_depth_distance_is_a_square_inside_the_noise_and_a_distance_outside():
 @pytest.mark.parametrize("off", [0.0, 0.06])
 def test_depth_term_of_the_objective(taichi, off):
     """Gaussians on the seen half of the ball, ``off`` [m] along the optical axis: colour and mask hardly see that."""
-    from masiv.splat.config import ReconstructConfig
     from masiv.splat.objective import PARAMETER_NAMES, Objective
 
     scene = ball_with_depth(opposite(size=64, focal=100.0)[:1])
@@ -399,6 +399,12 @@ def test_observed_depth_has_no_means_over_edges():
     assert away - RADIUS - 0.02 < float(values.min())
     assert float(values.max()) < away
     assert image.depth.values.shape == image.mask.shape
+    config = ReconstructConfig(crop_side=20, crop_padding=2)
+    stored = observed_images(scene, config, range(2))[0][0].depth  # as the fit reads it
+    assert stored is not None
+    for one, other in ((stored.values, image.depth.values), (stored.noise, image.depth.noise)):
+        torch.testing.assert_close(one, other)
+    assert bool((stored.known == image.depth.known).all())
     plain = observed_image(replace(scene, depth_noise=None), 0, 0, crop_side=20, crop_padding=2)
     assert plain is not None
     assert plain.depth is None
