@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from still import still
 
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.fill import DensityField, even_points, fill_volume, in_front_of_surface
+from masiv.continuum.fill import DensityField, depth_in_front, even_points, fill_volume
 from masiv.errors import MasivError
 
 CENTRE, RADIUS = np.array([0.05, 0.45, 0.0]), 0.25
@@ -71,8 +71,8 @@ def test_rendered_surface_carves_what_silhouettes_cannot_see(taichi):
     dynamic = still(sphere_points(1500, 0.7 * RADIUS), 0.012)
     shell, core = sphere_points(300, 0.97 * RADIUS), sphere_points(300, 0.6 * RADIUS)
     facing = shell[np.abs(shell[:, 1] - CENTRE[1] - 0.05) < 0.3 * RADIUS]
-    assert in_front_of_surface(scene, dynamic, 0, facing, 0.01).mean() > 0.7
-    assert not in_front_of_surface(scene, dynamic, 0, core, 0.01).any()
+    assert (depth_in_front(scene, dynamic, 0, facing) > 0.01).mean() > 0.7
+    assert not (depth_in_front(scene, dynamic, 0, core) > 0.01).any()
     hull, carved = fill_volume(scene, None, 0, CONFIG), fill_volume(scene, dynamic, 0, CONFIG)
     assert carved.volume < 0.85 * hull.volume
     assert carved.volume > (0.7 * RADIUS) ** 3 * 4 / 3 * np.pi * 0.95

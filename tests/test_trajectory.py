@@ -8,7 +8,7 @@ from still import still
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.consistency import consistent_particles
+from masiv.continuum.consistency import images_against
 from masiv.continuum.fill import FilledVolume
 from masiv.continuum.finetune import chamfer_targets
 from masiv.continuum.losses import below_ground, field_terms, load_views, outside_of_mask, stencil
@@ -60,7 +60,7 @@ def lattice(count: int = 6, spacing: float = 0.1) -> np.ndarray:
 
 def test_a_missed_motion_is_found(scene, dynamic, monkeypatch):
     # The still motion contradicts the masks; what is tested here is the fine-tuning.
-    monkeypatch.setattr("masiv.continuum.trajectory.consistent_particles", lambda s, n, p, *_: np.ones(len(p), bool))
+    monkeypatch.setattr("masiv.continuum.trajectory.images_against", lambda s, n, p, *_: np.zeros(len(p), int))
     result = estimate_trajectory(scene, dynamic, CONFIG.model_copy(update={"iterations": 250}), seed=1)
     assert result.positions.dtype == np.float32
     assert result.positions.shape[0] == scene.frame_count
@@ -182,5 +182,5 @@ def test_what_leaves_the_masks_or_the_world_is_carved(scene, dynamic):
     along = SHIFT / np.linalg.norm(SHIFT)
     probes = np.stack([centre - 0.18 * along, centre + 0.1 * along])
     config = CONFIG.model_copy(update={"carve_tolerance": 1.5, "carve_images": 3})
-    kept = consistent_particles(scene, dynamic.deformation, probes, config)
-    assert kept.tolist() == [False, True]
+    against = images_against(scene, dynamic.deformation, probes, config)
+    assert (against < config.carve_images).tolist() == [False, True]

@@ -11,14 +11,14 @@ from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
 
 
-def consistent_particles(
+def images_against(
     scene: Scene, network: DeformationNetwork, points: np.ndarray, config: TrajectoryConfig
 ) -> np.ndarray:
-    """Which frame-0 points (M, 3) [m] stay inside the masks while they move, (M,) bool.
+    """How many images count against each of the frame-0 ``points`` (M, 3) [m] as they move, (M,) int.
 
     An image (view and frame) counts against a point that it shows more than ``config.carve_tolerance`` pixels outside
-    of its mask. A frame at which a point is as far below the ground counts as all its views. A point is removed if
-    ``config.carve_images`` images count against it. The tolerance allows for errors of the motion, a first estimate.
+    of its mask. A frame at which a point is as far below the ground counts as all its views. The tolerance allows for
+    errors of the motion, a first estimate.
     """
     against = np.zeros(len(points), np.int32)
     start = torch.as_tensor(points, dtype=torch.float32)
@@ -35,4 +35,4 @@ def consistent_particles(
         if scene.ground is not None:
             below = scene.ground.height - moved @ scene.ground.normal
             against += len(views) * (below > config.carve_tolerance * pixel)
-    return against < config.carve_images
+    return against

@@ -20,7 +20,8 @@ from masiv.errors import MasivError
 from masiv.hull.carve import visual_hull
 from masiv.hull.depth import depth_views
 from masiv.hull.shadow_volume import remove_shadow_volume
-from masiv.hull.silhouette import sample_bilinear, silhouettes
+from masiv.hull.silhouette import Silhouette, sample_bilinear, silhouettes
+from masiv.hull.volume import VolumePrior
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 from masiv.splat.dynamic import DynamicGaussians
@@ -28,6 +29,8 @@ from masiv.splat.rasteriser import render
 
 _SMALLEST_PIECE = 0.1
 """Connected pieces smaller than this fraction of the largest one are noise of the masks."""
+_TOLERANCE_GROWTH = 1.25
+"""Factor of one step in the search for a tolerance of depth that leaves a probable volume."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +53,15 @@ def fill_volume(
     *,
     spacing: float | None = None,
     volume: float | None = None,
+    prior: VolumePrior | None = None,
 ) -> FilledVolume:
     """Fill the object of ``frame`` with about ``config.particle_count`` particles, or with the given ``spacing`` [m].
 
-    volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``. Without ``dynamic`` only the
-    silhouettes carve. Raises MasivError if nothing is left of the object or it is thinner than ``spacing``.
+    volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``. prior: of the object's volume.
+    Without ``dynamic`` only the silhouettes carve. Raises MasivError if nothing is left of the object or it is thinner
+    than ``spacing``.
     """
-    field = density_field(scene, dynamic, frame, config, volume=volume)
+    field = density_field(scene, dynamic, frame, config, volume=volume, prior=prior)
     if spacing is None:
         spacing = float((field.volume / config.particle_count) ** (1 / 3))
     points = even_points(field, spacing)
@@ -79,12 +84,13 @@ def fill_later_frame(
     frame: int,
     config: TrajectoryConfig,
     start: FilledVolume,
-    volume: float | None,
+    volume: float,
+    prior: VolumePrior | None = None,
 ) -> FilledVolume | None:
     """``fill_volume``, a little finer than ``start`` fills frame 0; None for a frame without a picture."""
     if frame not in scene.observed_frames:
         return None
-    return fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=volume)
+    return fill_volume(scene, dynamic, frame, config, spacing=0.9 * start.spacing, volume=volume, prior=prior)
 
 
 def density_field(
@@ -94,12 +100,16 @@ def density_field(
     config: TrajectoryConfig,
     *,
     volume: float | None = None,
+    prior: VolumePrior | None = None,
 ) -> DensityField:
     """Carve ``frame`` by its silhouettes and, with ``dynamic``, by the depth of the rendered surface; smooth it.
 
     Of a point cloud, the solid that it encloses or fills.
 
-    volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``.
+    volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``. prior: of the object's volume.
+    The depth of a surface that was fitted to noisy pictures is biased. If so much is carved that the volume is
+    improbable, the depth counts less: its tolerance grows until the volume is one standard deviation below the prior's
+    median.
     """
     if scene.load_cloud is not None:
         return cloud_volume(
@@ -112,31 +122,51 @@ def density_field(
     margin = 2
     lower = hull.points.min(axis=0) - margin * spacing
     index = np.rint((hull.points - lower) / spacing).astype(int)
-    density = np.zeros(index.max(axis=0) + 1 + margin, np.float32)
-    outside = np.full(len(hull.points), -np.inf)
     views = silhouettes(scene, frame)
-    for view in views:
-        distance, _, visible = view.distances(hull.points)
-        outside = np.maximum(outside, np.where(visible, distance, -np.inf))
+    outside = _outside_of_masks(views, hull.points, 0.25 * spacing)
     for depth in depth_views(scene, frame, views):
         outside = np.maximum(outside, np.maximum(depth.outside(hull.points), depth.behind(hull.points)))
     # A voxel at the edge of a silhouette, or at a measured surface, has the density of the part that is inside.
     filled = np.clip(0.5 - outside / spacing, 0.0, 1.0)
-    if dynamic is not None:
-        filled[in_front_of_surface(scene, dynamic, frame, hull.points, config.depth_tolerance * spacing)] = 0.0
-    density[tuple(index.T)] = filled
-    density = ndimage.uniform_filter(density, size=3, mode="constant")
-    density[~_main_pieces(density > 0.5)] = 0.0
-    if not (density > 0.5).any():
+
+    def smoothed(empty: np.ndarray | None) -> DensityField:
+        density = np.zeros(index.max(axis=0) + 1 + margin, np.float32)
+        density[tuple(index.T)] = filled if empty is None else np.where(empty, 0.0, filled)
+        density = ndimage.uniform_filter(density, size=3, mode="constant")
+        density[~_main_pieces(density > 0.5)] = 0.0
+        return DensityField(density, lower, spacing)
+
+    if dynamic is None:
+        field = smoothed(None)
+    else:
+        excess = depth_in_front(scene, dynamic, frame, hull.points)
+        tolerance = config.depth_tolerance * spacing
+        field = smoothed(excess > tolerance)
+        while prior is not None and field.volume < prior.lower and (excess > tolerance).any():
+            tolerance *= _TOLERANCE_GROWTH
+            field = smoothed(excess > tolerance)
+    if field.volume == 0:
         raise MasivError(f"frame {frame} of {scene.path}: nothing is left of the object behind its rendered surface")
-    return DensityField(density, lower, spacing)
+    return field
 
 
-def in_front_of_surface(
-    scene: Scene, dynamic: DynamicGaussians, frame: int, points: np.ndarray, tolerance: float
-) -> np.ndarray:
-    """Which points (N, 3) [m] two views or more show to be empty: nearer than the surface by ``tolerance`` [m]."""
-    votes = np.zeros(len(points), np.int32)
+def _outside_of_masks(views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Largest signed distance (N,) [m] of the ``points`` of a hull to the masks, but for one view that was outvoted."""
+    first, second = np.full((2, len(points)), -np.inf)
+    for view in views:
+        distance, _, visible = view.distances(points)
+        distance = np.where(visible, distance, -np.inf)
+        second = np.maximum(second, np.minimum(first, distance))
+        first = np.maximum(first, distance)
+    return np.where(first > tolerance, second, first)
+
+
+def depth_in_front(scene: Scene, dynamic: DynamicGaussians, frame: int, points: np.ndarray) -> np.ndarray:
+    """How far points (N, 3) [m] are in front of the rendered surface for two views or more, (N,) [m].
+
+    The second largest of the differences in depth; minus infinity where fewer than two views show a point.
+    """
+    first, second = np.full((2, len(points)), -np.inf)
     for view in scene.views:
         camera = scene.cameras[view]
         depth = surface_depth(dynamic, camera, frame / scene.fps)
@@ -144,8 +174,11 @@ def in_front_of_surface(
         depth = ndimage.minimum_filter(depth, size=3, mode="nearest")
         pixels, along = camera.project(points)
         shown = (along > 0) & (pixels >= 0).all(axis=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
-        votes[shown] += along[shown] < sample_bilinear(depth, pixels[shown]) - tolerance
-    return votes >= 2
+        here = np.full(len(points), -np.inf)
+        here[shown] = sample_bilinear(depth, pixels[shown]) - along[shown]
+        second = np.maximum(second, np.minimum(first, here))
+        first = np.maximum(first, here)
+    return second
 
 
 def _main_pieces(solid: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ particles, is fine-tuned until they fill every other frame. d(x, 0) = 0 by const
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,15 @@ import torch
 
 from masiv.checkpoint import Checkpoint
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.consistency import consistent_particles
+from masiv.continuum.consistency import images_against
 from masiv.continuum.density_field import even_points
 from masiv.continuum.fill import FilledVolume, density_field, fill_later_frame, hull_volume
 from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
 from masiv.files import write_npz
+from masiv.hull.carve import visual_hull
 from masiv.hull.velocity import with_velocities
+from masiv.hull.volume import VolumePrior, volume_prior
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
@@ -29,6 +32,8 @@ from masiv.splat.dynamic import DynamicGaussians
 
 _CHUNK = 8
 """Times that are evaluated together: limits the memory."""
+_HULLS = 5
+"""Frames whose hulls tell the volume."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,8 @@ class Trajectory:
     """Motion of the continuum.
 
     positions (T, Q, 3) float32 [m, world] at times (T,) [s]; positions[0] is the canonical frame. Each particle has
-    the volume spacing³ [m³]; volume = Q spacing³ [m³]. ``network`` gives the motion between the frames.
+    the volume spacing³ [m³]; volume = Q spacing³ [m³]. ``network`` gives the motion between the frames. volume_log_sd:
+    standard deviation of the volume's logarithm, by the cameras' view of random shapes; NaN if it is not known.
     """
 
     positions: np.ndarray
@@ -44,6 +50,7 @@ class Trajectory:
     spacing: float
     volume: float
     network: DeformationNetwork
+    volume_log_sd: float = math.nan
 
     def evaluate(self, times: np.ndarray) -> np.ndarray:
         """Positions (K, Q, 3) float32 [m] at any ``times`` (K,) [s] within the observed span."""
@@ -58,6 +65,7 @@ class Trajectory:
             times=self.times,
             spacing=self.spacing,
             volume=self.volume,
+            volume_log_sd=self.volume_log_sd,
             network_settings=json.dumps(self.network.settings),
             **weights,
         )
@@ -75,7 +83,9 @@ class Trajectory:
                     centre=weights["centre"], base_motion=weights["base_motion"], **settings
                 ).requires_grad_(False)
                 network.load_state_dict(weights)
-                return cls(file["positions"], file["times"], float(file["spacing"]), float(file["volume"]), network)
+                log_sd = float(file["volume_log_sd"]) if "volume_log_sd" in file else math.nan
+                spacing, volume = float(file["spacing"]), float(file["volume"])
+                return cls(file["positions"], file["times"], spacing, volume, network, log_sd)
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
             raise InputError(f"{path} is not a trajectory saved by masiv ({error}); run masiv trajectory") from error
 
@@ -95,29 +105,49 @@ def estimate_trajectory(
     """
     checkpoint = checkpoint or Checkpoint(None)
     scene = with_velocities(scene, dynamic.base_positions(scene.times))
-    start = fill_first_frame(scene, dynamic, config)
+    progress("volume", 0, 1)
+    prior = known_volume(scene, config)
+    start = fill_first_frame(scene, dynamic, config, prior)
     hull = hull_volume(scene, config)
+    same = None if prior is None else replace(prior, volume=start.volume)
     volumes = []
     for frame in range(1, scene.frame_count):
         progress("fill", frame, scene.frame_count - 1)
-        volumes.append(fill_later_frame(scene, dynamic, frame, config, start, hull))
+        volumes.append(fill_later_frame(scene, dynamic, frame, config, start, hull, same))
     network = fine_tune(scene, dynamic, start, volumes, config, seed=seed, checkpoint=checkpoint, progress=progress)
     positions = positions_at(network, start.points, scene.times)
     if not np.isfinite(positions).all():
         raise MasivError("trajectory: the motion became non-finite; lower trajectory.learning_rate")
-    return Trajectory(positions, scene.times, start.spacing, start.volume, network)
+    log_sd = math.nan if prior is None else prior.log_sd
+    return Trajectory(positions, scene.times, start.spacing, start.volume, network, log_sd)
 
 
-def fill_first_frame(scene: Scene, dynamic: DynamicGaussians, config: TrajectoryConfig) -> FilledVolume:
+def known_volume(scene: Scene, config: TrajectoryConfig) -> VolumePrior | None:
+    """The prior of the object's volume from hulls of some frames; None if depth or points measure the surface."""
+    if scene.load_cloud is not None or scene.depth_noise is not None:
+        return None
+    observed = scene.observed_frames
+    chosen = {observed[i] for i in np.linspace(0, len(observed) - 1, min(_HULLS, len(observed))).round().astype(int)}
+    return volume_prior(scene, {k: visual_hull(scene, k, resolution=config.fill_resolution) for k in sorted(chosen)})
+
+
+def fill_first_frame(
+    scene: Scene, dynamic: DynamicGaussians, config: TrajectoryConfig, prior: VolumePrior | None = None
+) -> FilledVolume:
     """The canonical continuum: frame 0 filled, without the points whose motion leaves the masks of later frames.
 
     Carving over time uses the silhouettes of all frames. Corners of the hull that no camera can exclude at frame 0 are
-    outside of a silhouette as soon as the object has turned or touched the ground.
+    outside of a silhouette as soon as the object has turned or touched the ground. prior: of the object's volume. Masks
+    and motion have errors, so it takes more images to remove a point if less than a probable volume would be left.
     """
-    field = density_field(scene, dynamic, 0, config)
+    field = density_field(scene, dynamic, 0, config, prior=prior)
     solid = np.argwhere(field.density > 0.5)
     voxels = field.lower + field.spacing * solid
-    kept = consistent_particles(scene, dynamic.deformation, voxels, config)
+    against = images_against(scene, dynamic.deformation, voxels, config)
+    limit = config.carve_images
+    while prior is not None and (against < limit).sum() * field.spacing**3 < prior.lower and (against >= limit).any():
+        limit += config.carve_images
+    kept = against < limit
     field.density[tuple(solid[~kept].T)] = 0.0
     if not kept.any():
         raise MasivError("trajectory: the motion moves the whole object out of its masks; run reconstruct for longer")
