@@ -73,9 +73,9 @@ class StoredImages(Sequence[ObservedImage]):
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
         view, camera, stored, depth = self._images[index]
-        return ObservedImage(
-            view, camera, *self._read(stored), None if depth is None else ObservedDepth(*self._read(depth))
-        )
+        colour, mask, valid = self._read(stored)
+        measured = None if depth is None else ObservedDepth(*self._read(depth))
+        return ObservedImage(view, camera, colour, mask, valid, measured)
 
     def _read(self, stored: list[StoredArray]) -> list[torch.Tensor]:
         return [torch.from_numpy(self._file.read(array)) for array in stored]
