@@ -12,7 +12,9 @@ from textured_ball import FPS, FRAMES, ball, camera_at
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
+from masiv.pipeline import stages
 from masiv.progress import silent
+from masiv.runfolder import Request, RunFolder
 from masiv.scene.calibration import NO_CORRECTION, Calibration, CameraCorrection, corrected_camera
 from masiv.scene.shutter import Shutter
 from masiv.splat.config import CalibrationConfig
@@ -257,6 +259,47 @@ def test_calibration_round_trip_and_scenes_that_it_applies_to(tmp_path):
     with pytest.raises(InputError, match="not a calibration"):
         Calibration.load(tmp_path)
     assert Calibration.load(tmp_path / "none") is None
+
+
+def test_later_stages_see_the_refined_cameras_and_runs_without_them_the_given_ones(tmp_path):
+    scene = filmed(truth)
+    request = Request({}, tmp_path, {}, fit_frames=FRAMES - 1, holdout_cameras=(3,))
+    run = RunFolder.create_or_resume(tmp_path / "run", request)
+    made = calibration_of(scene.restricted(FRAMES - 1, (3,)))
+    made.save(run.path)  # a reconstruct stage that was killed here is not done
+    assert stages.calibrated_scene(run, scene) is scene
+    with run.stage("reconstruct"):
+        pass
+    fitted = stages.training_scene(run, scene)
+    np.testing.assert_array_equal(fitted.cameras[1].world_to_camera, made.refined[1].world_to_camera)
+    assert fitted.view_time_offsets == (0, CORRECTION.time_offset, 0, 0, 0, 0)
+    assert (fitted.frame_count, fitted.views) == (FRAMES - 1, (0, 1, 2, 4, 5, 6))
+    (run.path / "calibration.json").unlink()  # a run of an earlier version
+    assert stages.training_scene(run, scene).cameras == scene.cameras
+
+
+def test_a_clock_shifts_the_motion_of_its_images_alone():
+    """The points of an image are those at the frame's time plus the offset of its camera."""
+    camera = CAMERAS[0]
+    blank = torch.zeros(camera.height, camera.width)
+    seen = [
+        [ObservedImage(view, CAMERAS[view], blank[..., None].expand(-1, -1, 3), blank, blank + 1) for view in (0, 1)]
+    ]
+    seen *= 2
+    part = Part(((0, 1, np.zeros(3)), (1, 0, np.zeros(3)), (1, 1, np.zeros(3))), 3, (0, 1), 2, None, scale_term=False)
+    offsets = (0.01, -0.02)
+    known = Objective(CONFIG, 0.02, 0.2, FPS, None, (), seen, offsets)
+    np.testing.assert_allclose(
+        known._moments(part, None).times, [offsets[1], 1 / FPS + offsets[0], 1 / FPS + offsets[1]], atol=1e-7
+    )
+    exact = Objective(CONFIG, 0.02, 0.2, FPS, None, (), seen)
+    np.testing.assert_allclose(exact._moments(part, None).times, [0, 1 / FPS], atol=1e-7)
+    made = perturbed(formation())()
+    found = known._moments(part, made)
+    clocks = made.cameras[:, 7].detach().numpy()
+    expected = [offsets[1] + clocks[1], 1 / FPS + offsets[0] + clocks[0], 1 / FPS + offsets[1] + clocks[1]]
+    np.testing.assert_allclose(found.times.detach(), expected, atol=1e-7)
+    assert (found.of_image, found.of_frame) == ([0, 1, 2], {0: 0, 1: 1})
 
 
 def reprojection(scene, exact, cameras):
