@@ -26,7 +26,7 @@ def disc(centre: tuple[float, float], radius: float) -> np.ndarray:
 
 
 def recording(rng: np.random.Generator, *, noise: float = 4.0, jpeg: int | None = 60, gain: float = 1.0):
-    """Pictures (T, H, W, 3), the plate, and true coverages (T, H, W): a textured disc that moves, with a soft shadow."""
+    """Pictures (T, H, W, 3), the plate, true coverages (T, H, W): a textured disc that moves, with a soft shadow."""
     empty = floor(rng)
     patches = rng.uniform(40, 230, (5, 5, 3))
     pictures, covers = [], []

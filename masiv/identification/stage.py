@@ -29,6 +29,7 @@ from masiv.scene.scene import Scene
 from masiv.simulation.twin_effects import effect_members
 from masiv.subsample import random_subset
 from masiv.twin import Twin
+from masiv.twin.twin import VOLUME_ERROR
 
 
 def identify(
@@ -82,9 +83,15 @@ def identify(
             "initial_omega_rad_per_s": [float(v) for v in initial_motion.omega],
             "free_flight_last_frame": initial_motion.last_frame,
             "frames": scene.frame_count,
+            **_volume_error(trajectory),
             "history": result.history,
         },
     )
+
+
+def _volume_error(trajectory: Trajectory) -> dict[str, float]:
+    error = float(trajectory.volume * trajectory.volume_log_sd)
+    return {VOLUME_ERROR: error} if np.isfinite(error) else {}
 
 
 def relearn(

@@ -77,9 +77,15 @@ def run_numbers(
             "particles": int(trajectory.positions.shape[1]),
             "spacing_m": float(trajectory.spacing),
             "volume_m3": float(trajectory.volume),
+            **_volume_error(trajectory),
         },
         "seconds": run.seconds(),
     }
+
+
+def _volume_error(trajectory: Trajectory) -> dict[str, float]:
+    error = float(trajectory.volume * trajectory.volume_log_sd)
+    return {"volume_standard_error_m3": error} if np.isfinite(error) else {}
 
 
 def material_numbers(run: RunFolder) -> dict[str, Any]:

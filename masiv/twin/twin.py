@@ -18,6 +18,9 @@ from masiv.twin.document import TWIN_FILE, read_document, write_document
 if TYPE_CHECKING:
     from masiv.materials.law import Law
 
+VOLUME_ERROR = "volume_standard_error_m3"
+"""Key of ``Twin.fit``: standard error of the volume of a filmed body."""
+
 
 @dataclass(frozen=True)
 class Twin:

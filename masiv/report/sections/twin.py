@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from masiv.report.page import Page
+from masiv.twin.twin import VOLUME_ERROR
 
 if TYPE_CHECKING:
     from masiv.twin import Twin
@@ -31,7 +32,7 @@ def _rows(twin: Twin) -> list[list[Any]]:
     for body in twin.bodies:
         label = f" of {body.name}" if len(twin.bodies) > 1 else ""
         rows += [
-            [f"volume{label}", float(body.volume), "m³", None],
+            [f"volume{label}", float(body.volume), "m³", twin.fit.get(VOLUME_ERROR)],
             [f"density{label} (given, not identified)", float(body.density), "kg/m³", None],
         ]
     rows.append(
@@ -43,7 +44,11 @@ def _rows(twin: Twin) -> list[list[Any]]:
     for name, row in law.get("parameters", {}).items():
         rows.append([name.replace("_", " "), row["value"], row["unit"], row.get("stderr")])
     fit = twin.fit if "refined" not in twin.fit else twin.fit["refined"]  # the rest is of the law before
-    rows += [[name.replace("_", " "), value, "", None] for name, value in fit.items() if name != "history"]
+    rows += [
+        [name.replace("_", " "), value, "", None]
+        for name, value in fit.items()
+        if name not in ("history", VOLUME_ERROR)
+    ]
     return rows
 
 
