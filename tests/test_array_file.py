@@ -7,13 +7,14 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import torch
 from ring_scene import ring, spheres_scene
 
 from masiv.array_file import ArrayFile
 from masiv.continuum.losses import load_views
 from masiv.scene.frame_cache import FrameCache
 from masiv.splat.config import ReconstructConfig
-from masiv.splat.observed_image import observed_image, observed_images
+from masiv.splat.observed_image import ObservedDepth, ObservedImage, StoredImages, observed_image, observed_images
 
 FRAMES = 30
 
@@ -65,6 +66,18 @@ def test_images_of_all_frames_are_not_in_memory_and_have_the_same_bits():
         np.testing.assert_array_equal(image.camera.intrinsics, expected.camera.intrinsics)
         for name in ("colour", "mask", "valid"):
             np.testing.assert_array_equal(getattr(image, name), getattr(expected, name))
+
+
+def test_a_depth_is_stored_with_its_image():
+    one, two = torch.rand(3, 2), torch.rand(3, 2)
+    depth = ObservedDepth(one, two, one + two)
+    plain = ObservedImage(1, ring(1)[0], torch.rand(3, 2, 3), two, one)
+    stored = StoredImages(ArrayFile(), [plain, dataclasses.replace(plain, depth=depth)])
+    assert stored[0].depth is None
+    found = stored[1].depth
+    assert found is not None
+    for name in ("values", "noise", "known"):
+        assert torch.equal(getattr(found, name), getattr(depth, name))
 
 
 def test_masks_of_all_frames_are_not_in_memory_and_have_the_same_bits():

@@ -26,8 +26,9 @@ from masiv.observations.read import read_scene
 from masiv.scene.depth import back_projected, read_depth
 from masiv.scene.depth_masks import from_empty_depth
 from masiv.scene.summary import as_text, summarise
+from masiv.splat.config import ReconstructConfig
 from masiv.splat.losses import depth_distance
-from masiv.splat.observed_image import ObservedDepth, observed_image
+from masiv.splat.observed_image import ObservedDepth, observed_image, observed_images
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
 DEPTH_FRAME = 700  # millimetres at pixel (0, 0) of a picture, one more a column
@@ -356,6 +357,36 @@ def test_depth_distance_is_a_square_inside_the_noise_and_a_distance_outside():
     assert float(depth_distance(3 * one, one, unknown)) == 0
 
 
+@pytest.mark.parametrize("off", [0.0, 0.06])
+def test_depth_term_of_the_objective(taichi, off):
+    """Gaussians on the seen half of the ball, ``off`` [m] along the optical axis: colour and mask hardly see that."""
+    from masiv.splat.objective import PARAMETER_NAMES, Objective
+
+    scene = ball_with_depth(opposite(size=64, focal=100.0)[:1])
+    camera, image = scene.cameras[0], observed_image(scene, 0, 0, crop_side=64, crop_padding=2)
+    assert image is not None
+    axis = camera.world_to_camera[2, :3]
+    points = back_projected(camera, ball_depth(camera)) + off * axis
+    means = torch.tensor(points, dtype=torch.float32, requires_grad=True)
+    count = len(points)
+    rest = torch.full((count,), float(np.log(0.006))), torch.full((count,), 2.0), torch.full((count, 3), 1.3)
+    gaussians = dict(zip(PARAMETER_NAMES, (means, *rest), strict=True))
+    losses = {}
+    for weight in (0.0, 0.3):
+        config = ReconstructConfig(depth_weight=weight)
+        objective = Objective(config, 0.006, RADIUS, 24.0, None, (), [[image]])
+        network: torch.nn.Module | None = None  # frame 0 does not move
+        losses[weight] = objective(gaussians, network, (), [(0, 0)], 1.0, np.random.default_rng(0))  # type: ignore[arg-type]
+    term = float((losses[0.3] - losses[0.0]).detach()) * RADIUS / 0.3
+    assert term == pytest.approx(
+        max(0.0, off - 0.5 * NOISE.constant), abs=8e-3
+    )  # pixels are 17 mm wide, and steep at the rim
+    if off:
+        (gradient,) = torch.autograd.grad(losses[0.3] - losses[0.0], [means])
+        forces = gradient.double().numpy().sum(axis=0)
+        assert forces @ axis > 0.9 * np.linalg.norm(forces)  # a step of descent goes towards the camera
+
+
 def test_observed_depth_has_no_means_over_edges():
     scene = ball_with_depth(opposite())
     image = observed_image(scene, 0, 0, crop_side=20, crop_padding=2)
@@ -368,6 +399,12 @@ def test_observed_depth_has_no_means_over_edges():
     assert away - RADIUS - 0.02 < float(values.min())
     assert float(values.max()) < away
     assert image.depth.values.shape == image.mask.shape
+    config = ReconstructConfig(crop_side=20, crop_padding=2)
+    stored = observed_images(scene, config, range(2))[0][0].depth  # as the fit reads it
+    assert stored is not None
+    for one, other in ((stored.values, image.depth.values), (stored.noise, image.depth.noise)):
+        torch.testing.assert_close(one, other)
+    assert bool((stored.known == image.depth.known).all())
     plain = observed_image(replace(scene, depth_noise=None), 0, 0, crop_side=20, crop_padding=2)
     assert plain is not None
     assert plain.depth is None

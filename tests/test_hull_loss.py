@@ -1,10 +1,12 @@
 """The loss of a hull: zero if Gaussians fill it, with a gradient towards what they leave empty."""
 
+import pickle
+
 import numpy as np
 import torch
 
 from masiv.hull.carve import VisualHull
-from masiv.splat.hull_loss import HullLoss
+from masiv.splat.hull_loss import HullLoss, TreeCache
 
 SPACING = 0.01
 
@@ -35,3 +37,24 @@ def test_an_empty_part_of_a_hull_attracts_gaussians():
     far, along = loss_of(hull, means)
     assert far > SPACING
     assert along < 0  # the loss falls where Gaussians rise
+
+
+def test_a_hull_is_kept_small_and_to_the_last_bit():
+    hull, _ = slab(12)
+    shuffled = np.random.default_rng(0).permutation(len(hull.points))[:-5]
+    hull = VisualHull(hull.points[shuffled] + np.array([0.3, -1 / 7, 2.1]), SPACING, hull.surface[shuffled])
+    loss = HullLoss(hull)
+    np.testing.assert_array_equal(loss.points(), hull.points)
+    assert len(pickle.dumps(loss)) < 0.4 * hull.points.nbytes
+
+
+def test_the_search_trees_of_many_hulls_are_bounded_and_change_nothing():
+    hull, means = slab(12)
+    cache = TreeCache(max_points=2 * len(hull.points))
+    shifts = [np.array([0.0, 0.02 * k, 0.0]) for k in range(5)]
+    hulls = [VisualHull(hull.points + shift, SPACING, hull.surface) for shift in shifts]
+    together, alone = [HullLoss(h, cache) for h in hulls], [HullLoss(h) for h in hulls]
+    drawn = alone[0].draw(len(means), 300, np.random.default_rng(1))
+    for k in (0, 1, 2, 3, 4, 0, 3, 3, 1):
+        assert together[k](means, *drawn) == alone[k](means, *drawn)
+        assert cache.points <= cache.max_points

@@ -181,7 +181,7 @@ def test_trajectory_tracks_the_truth(followed):
 @pytest.mark.slow
 def test_the_whole_job_without_a_picture(tmp_path, taichi):
     """inspect, identify with held-out frames, evaluate, simulate and the report."""
-    from masiv.pipeline import Overrides, SceneRequest, SimulateRequest, inspect_scene, open_run, reopen_run
+    from masiv.pipeline import Overrides, SceneRequest, SimulateRequest, inspect_scene, open_run, reopen_run, stages
 
     write_scene(tmp_path / "scene", 5, count=1500)
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(TINY))
@@ -201,6 +201,10 @@ def test_the_whole_job_without_a_picture(tmp_path, taichi):
     again = reopen_run(tmp_path / "run")
     errors = again.evaluate(tmp_path / "gt").data["motion"]["trajectory"]["observed"]
     assert errors["tracked_error_mm"] < 10
+    held_out = stages.ensure_held_out_trajectory(again.folder, again.config, read_scene(tmp_path / "scene"), silent)
+    assert held_out is not None
+    last = held_out.positions[4] - moved(held_out.positions[0].astype(float), 4)
+    assert np.linalg.norm(last, axis=1).mean() < 1.0 * held_out.spacing
     again.simulate(SimulateRequest(frames=2), tmp_path / "out")
     assert (tmp_path / "out/rollout.npz").is_file()
     with pytest.raises(InputError, match="leave out --render"):

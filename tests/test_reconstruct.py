@@ -200,10 +200,10 @@ def test_a_second_process_that_dies_is_told_of_and_none_is_left(scene, monkeypat
             super().__init__()
             started.append(self._process)
 
-        def submit(self, *given):
+        def submit(self, *given, **options):
             if len(started) == 1:
                 started.append(self._process.kill())
-            super().submit(*given)
+            super().submit(*given, **options)
 
     monkeypatch.setattr("masiv.splat.reconstruct.GradientWorker", Dies)
     config = CONFIG.model_copy(update={"iterations": 5, "processes": 2})

@@ -84,7 +84,7 @@ def fill_later_frame(
     frame: int,
     config: TrajectoryConfig,
     start: FilledVolume,
-    volume: float,
+    volume: float | None,
     prior: VolumePrior | None = None,
 ) -> FilledVolume | None:
     """``fill_volume``, a little finer than ``start`` fills frame 0; None for a frame without a picture."""

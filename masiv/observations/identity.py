@@ -75,7 +75,8 @@ def _scene_identity(scene: Scene) -> dict[str, Any]:
     for view, frame in ((visible[0], 0), (visible[-1], scene.frame_count - 1)):
         picture = scene.frame(view, frame)
         pictures.update(picture.image.tobytes())
-        pictures.update(picture.mask.tobytes())
+        if not scene.masks_estimated:  # those follow from the pictures and from this version of masiv
+            pictures.update(picture.mask.tobytes())
         if picture.depth is not None:
             pictures.update(picture.depth.tobytes())
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,9 @@ class VideoRun(Run):
             "seconds": self.folder.seconds(),
         }
         text = f"{self.folder.trajectory}: {particles} particles, {frames} frames, {made.spacing * 1e3:.1f} mm apart"
-        return Summary(data, f"{text}, {made.volume * 1e3:.2f} litres")
+        data["volume_log_sd"] = made.volume_log_sd if math.isfinite(made.volume_log_sd) else None
+        error = "" if math.isnan(made.volume_log_sd) else f" ± {made.volume * made.volume_log_sd * 1e3:.2f}"
+        return Summary(data, f"{text}, {made.volume * 1e3:.2f}{error} litres")
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()

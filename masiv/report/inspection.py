@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from masiv.calibration.consistency import odd_camera, silhouette_consistency
+from masiv.hull.mask_quality import mask_quality
 from masiv.observations.identity import identity
 from masiv.report.contact_sheet import write_contact_sheet
 from masiv.scene.scene import Scene
@@ -26,6 +27,11 @@ def inspection(read: Scene | Tracks, picture: Path) -> tuple[dict[str, Any], str
     summary = {**summarise(read), **identity(read), "picture": str(picture)}
     for view, error in zip(agreement.views, agreement.pixels, strict=True):
         summary["cameras"][view]["consistency_px"] = float(error) if np.isfinite(error) else None
+    quality = mask_quality(read)
+    for view, agrees, doubt in zip(quality.views, quality.agreement, quality.doubt, strict=True):
+        summary["cameras"][view]["mask_agreement"] = float(agrees) if np.isfinite(agrees) else None
+        summary["cameras"][view]["mask_doubt"] = float(doubt) if np.isfinite(doubt) else None
+    summary["problems"] += quality.problems()
     odd = odd_camera(read, agreement)
     summary["problems"] += [] if odd is None else [odd]
     write_contact_sheet(

@@ -45,7 +45,7 @@ def _shutters(scene: Scene) -> dict[str, Any]:
 def summarise(scene: Scene) -> dict[str, Any]:
     """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem.
 
-    ``consistency_px`` of the cameras is not known here.
+    ``consistency_px``, ``mask_agreement`` and ``mask_doubt`` of the cameras are not known here.
     """
     if scene.load_cloud is not None:
         return _summarise_clouds(scene)
@@ -85,6 +85,8 @@ def summarise(scene: Scene) -> dict[str, Any]:
                 "position_m": camera.centre.tolist(),
                 "frames": pictures.get(view, 0),
                 "consistency_px": None,
+                "mask_agreement": None,
+                "mask_doubt": None,
             }
             for view, camera in enumerate(scene.cameras)
         ],
@@ -157,8 +159,14 @@ def as_text(summary: dict[str, Any]) -> str:
 
 
 def _agreement(cameras: list[dict[str, Any]]) -> list[str]:
-    """One line: the error of each camera's silhouettes against those of the others."""
-    known = [
-        f"{index}: {c['consistency_px']:.2f}" for index, c in enumerate(cameras) if c["consistency_px"] is not None
-    ]
-    return [f"agreement of the silhouettes with those of the other cameras [px]  {', '.join(known)}"] if known else []
+    """One line for each measure of a camera against the others."""
+    measures = (
+        ("consistency_px", ".2f", "agreement of the silhouettes with those of the other cameras [px]"),
+        ("mask_agreement", ".2f", "intersection over union of masks and the hull of all views"),
+        ("mask_doubt", ".2f", "share of the masks that is wrong by their own probabilities"),
+    )
+    lines = []
+    for key, form, title in measures:
+        known = [f"{k}: {camera[key]:{form}}" for k, camera in enumerate(cameras) if camera[key] is not None]
+        lines += [f"{title}  {', '.join(known)}"] if known else []
+    return lines

@@ -26,7 +26,7 @@ from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.extrapolate import extrapolate_motion
 from masiv.splat.gaussians import Gaussians
-from masiv.splat.hull_loss import HullLoss
+from masiv.splat.hull_loss import HullLoss, TreeCache
 from masiv.splat.losses import neighbour_pairs
 from masiv.splat.objective import Objective
 from masiv.splat.observed_image import observed_images
@@ -138,7 +138,8 @@ class _ExtensionFit:
             scene = with_velocities(scene)
             first, *hulls = [visual_hull(scene, f, resolution=config.hull_resolution) for f in (0, *frames)]
             hulls = [remove_shadow_volume(scene, f, hull, first.volume) for f, hull in zip(frames, hulls, strict=True)]
-            losses = {frame: HullLoss(hull) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
+            cache = TreeCache()
+            losses = {frame: HullLoss(hull, cache) for frame, hull in zip(self.observed, hulls[1:], strict=True)}
             self.objective = Objective(
                 config,
                 scale,

@@ -46,16 +46,19 @@ class ObservedImage:
     valid: torch.Tensor
     depth: ObservedDepth | None = None
 
+    @property
+    def tensors(self) -> list[torch.Tensor]:
+        """colour, mask, valid; with depth, its values, noise and known pixels."""
+        depth = [] if self.depth is None else [self.depth.values, self.depth.noise, self.depth.known]
+        return [self.colour, self.mask, self.valid, *depth]
+
 
 class StoredImages(Sequence[ObservedImage]):
     """The images of one frame. Their pixels are in a file, and are read when an image is asked for."""
 
     def __init__(self, file: ArrayFile, images: Iterable[ObservedImage]) -> None:
         self._file = file
-        self._images = [
-            (image.view, image.camera, [file.append(t.numpy()) for t in (image.colour, image.mask, image.valid)])
-            for image in images
-        ]
+        self._images = [(image.view, image.camera, [file.append(t.numpy()) for t in image.tensors]) for image in images]
 
     def __len__(self) -> int:
         return len(self._images)
@@ -68,7 +71,8 @@ class StoredImages(Sequence[ObservedImage]):
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
         view, camera, stored = self._images[index]
-        return ObservedImage(view, camera, *(torch.from_numpy(self._file.read(array)) for array in stored))
+        pixels = [torch.from_numpy(self._file.read(array)) for array in stored]
+        return ObservedImage(view, camera, *pixels[:3], depth=ObservedDepth(*pixels[3:]) if pixels[3:] else None)
 
 
 def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[StoredImages]:

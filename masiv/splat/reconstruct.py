@@ -23,7 +23,7 @@ from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.splat.extrapolate import extrapolate_motion
 from masiv.splat.gaussians import Gaussians
-from masiv.splat.hull_loss import HullLoss
+from masiv.splat.hull_loss import HullLoss, TreeCache
 from masiv.splat.image_formation import ImageFormation
 from masiv.splat.initialize import InitialGaussians, initial_gaussians
 from masiv.splat.losses import neighbour_pairs
@@ -104,7 +104,8 @@ class _Fit:
         initial = initial_gaussians(
             scene, config.gaussians, config.hull_resolution, np.random.default_rng((self.seed, 0))
         )
-        hulls = {frame: HullLoss(hull) for frame, hull in zip(initial.frames, initial.hulls, strict=True)}
+        cache = TreeCache()
+        hulls = {frame: HullLoss(hull, cache) for frame, hull in zip(initial.frames, initial.hulls, strict=True)}
         self.objective = Objective(
             config,
             initial.scale,
