@@ -286,7 +286,14 @@ def test_a_clock_shifts_the_motion_of_its_images_alone():
         [ObservedImage(view, CAMERAS[view], blank[..., None].expand(-1, -1, 3), blank, blank + 1) for view in (0, 1)]
     ]
     images = seen[0]
-    part = Part(tuple((frame, images[view], np.zeros(3)) for frame, view in ((0, 1), (1, 0), (1, 1))), 3, (0, 1), 2, None, scale_term=False)
+    part = Part(
+        tuple((frame, images[view], np.zeros(3)) for frame, view in ((0, 1), (1, 0), (1, 1))),
+        3,
+        (0, 1),
+        2,
+        None,
+        scale_term=False,
+    )
     offsets = (0.01, -0.02)
     known = Objective(CONFIG, 0.02, 0.2, FPS, None, (), [images] * 2, offsets)
     np.testing.assert_allclose(
