@@ -285,14 +285,21 @@ def test_a_clock_shifts_the_motion_of_its_images_alone():
     seen = [
         [ObservedImage(view, CAMERAS[view], blank[..., None].expand(-1, -1, 3), blank, blank + 1) for view in (0, 1)]
     ]
-    seen *= 2
-    part = Part(((0, 1, np.zeros(3)), (1, 0, np.zeros(3)), (1, 1, np.zeros(3))), 3, (0, 1), 2, None, scale_term=False)
+    images = seen[0]
+    part = Part(
+        tuple((frame, images[view], np.zeros(3)) for frame, view in ((0, 1), (1, 0), (1, 1))),
+        3,
+        (0, 1),
+        2,
+        None,
+        scale_term=False,
+    )
     offsets = (0.01, -0.02)
-    known = Objective(CONFIG, 0.02, 0.2, FPS, None, (), seen, offsets)
+    known = Objective(CONFIG, 0.02, 0.2, FPS, None, (), [images] * 2, offsets)
     np.testing.assert_allclose(
         known._moments(part, None).times, [offsets[1], 1 / FPS + offsets[0], 1 / FPS + offsets[1]], atol=1e-7
     )
-    exact = Objective(CONFIG, 0.02, 0.2, FPS, None, (), seen)
+    exact = Objective(CONFIG, 0.02, 0.2, FPS, None, (), [images] * 2)
     np.testing.assert_allclose(exact._moments(part, None).times, [0, 1 / FPS], atol=1e-7)
     made = perturbed(formation())()
     found = known._moments(part, made)
