@@ -5,8 +5,8 @@ usage: python benchmarks/recordings.py OUT --scenes SCENE … [--cameras 11 4] [
 
 SCENE: a folder in the PAC-NeRF layout with gt/particles_F.npy. Faults: `calibration`: each camera is off by 0.15° about
 each axis, 2 mm along each axis and 0.3 % in focal length (standard deviations), no masks; `pictures`: noise of 4 grey
-levels, JPEG of quality 60, no masks; `all`: both. `none` keeps the masks. Every case runs `masiv identify --preset quick
---fit-frames 12` and `masiv evaluate`.
+levels, JPEG of quality 60, no masks; `all`: both. `none` keeps the masks. Every case runs `masiv identify --preset
+quick --fit-frames 12` and `masiv evaluate`.
 """
 
 from __future__ import annotations

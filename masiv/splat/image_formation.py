@@ -25,6 +25,10 @@ INDEPENDENT_ERRORS = 50
 (shape, shading, motion), which are alike over patches of about a seventh of the object's width, and in all frames of a
 camera. With all pixels counted as independent the prior had no weight, and cameras circled the object by a degree to
 explain shading. The number is an estimate: it was not calibrated."""
+MIN_PRIOR_SCALE, MAX_PRIOR_SCALE = 0.02, 5.0
+"""Limits of what the silhouettes' agreement does to the prior standard deviations: no camera is exact, and a camera
+that
+is far off is found by ``inspect``, not by a fit."""
 EXPOSURE_STEP = 0.02
 """Unit of the exposure's parameters: a change of 2 % of white is as visible as about a pixel of displacement."""
 
@@ -54,8 +58,10 @@ class ImageFormation(torch.nn.Module):
         config: CalibrationConfig,
         points: np.ndarray,
         velocities: np.ndarray,
+        inconsistency: np.ndarray | None = None,
     ) -> None:
-        """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs."""
+        """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs. inconsistency (V,) [pixels]:
+        of the given silhouettes, see ``scaled_deviations``."""
         super().__init__()
         self.fps, self.config, self.points = fps, config, points
         self.pivot = points.mean(axis=0)
@@ -65,6 +71,8 @@ class ImageFormation(torch.nn.Module):
         self.exposure_weight = 1 / frame_count
         poses = np.stack([camera.world_to_camera for camera in cameras])
         deviations = prior_deviations(cameras, self.pivot, fps, config)
+        if inconsistency is not None:
+            deviations = scaled_deviations(deviations, inconsistency, cameras, self.pivot, points, velocities)
         linear = _gauge_free_steps(cameras, self.pivot, points, velocities, deviations)
         self.register_buffer("linear", torch.tensor(linear, dtype=torch.float32), persistent=False)
         self.register_buffer("rotations", torch.tensor(poses[:, :3, :3], dtype=torch.float32), persistent=False)
@@ -170,6 +178,36 @@ def prior_deviations(cameras: Sequence[Camera], pivot: np.ndarray, fps: float, c
             + [config.focal_fraction, config.time_frames / fps]
         )
     return np.array(rows)
+
+
+def scaled_deviations(
+    deviations: np.ndarray,
+    inconsistency: np.ndarray,
+    cameras: Sequence[Camera],
+    pivot: np.ndarray,
+    points: np.ndarray,
+    velocities: np.ndarray,
+) -> np.ndarray:
+    """Prior standard deviations (V, 8) that displace the object by what its silhouettes disagree.
+
+    inconsistency (V,) [pixels]: epipolar tangency error of each camera against the others, NaN if unknown. For random
+    errors it is about the RMS displacement of the picture. Pose with focal length, and clock, are scaled apart: each of
+    them alone may be the cause. So cameras whose silhouettes agree stay where they are, also if the pictures cannot
+    tell a clock from a height.
+    """
+    scaled = deviations.copy()
+    for row, camera, error in zip(scaled, cameras, inconsistency, strict=True):
+        if not np.isfinite(error):
+            continue
+        rotation = camera.world_to_camera[:3, :3]
+        at_camera = np.eye(POSE)
+        at_camera[3:6, :3] = _cross_matrix(rotation @ pivot + camera.world_to_camera[:3, 3])
+        jacobian = displacement_jacobian(camera, pivot, points, velocities) @ np.linalg.inv(at_camera)
+        squares = ((jacobian * row) ** 2).sum(axis=1).mean(axis=0)
+        for part, largest in ((slice(0, 7), MAX_PRIOR_SCALE), (slice(7, 8), 1.0)):
+            expected = np.sqrt(squares[part].sum())
+            row[part] *= np.clip(error / max(expected, 1e-9), MIN_PRIOR_SCALE, largest)
+    return scaled
 
 
 def _gauge_free_steps(

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from masiv import runtime
+from masiv.calibration.consistency import silhouette_consistency
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.progress import Progress
@@ -182,6 +183,7 @@ class _Fit:
             self.config.calibration,
             np.concatenate(surfaces),
             np.repeat(velocities, [len(points) for points in surfaces], axis=0),
+            silhouette_consistency(scene).pixels,
         )
 
     @property
