@@ -60,8 +60,8 @@ class ImageFormation(torch.nn.Module):
         velocities: np.ndarray,
         inconsistency: np.ndarray | None = None,
     ) -> None:
-        """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs. inconsistency (V,) [pixels]:
-        of the given silhouettes, see ``scaled_deviations``."""
+        """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs. inconsistency (V,)
+        [pixels]: of the given silhouettes, see ``scaled_deviations``."""
         super().__init__()
         self.fps, self.config, self.points = fps, config, points
         self.pivot = points.mean(axis=0)
