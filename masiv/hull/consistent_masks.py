@@ -18,7 +18,7 @@ from masiv.hull.votes import FEWEST_VIEWS, Votes, consensus, vote
 from masiv.scene.frame_cache import Frame
 from masiv.scene.scene import Scene
 
-RESOLUTION = 48
+RESOLUTION = 36
 _ROUNDS = 2
 _LARGEST_HOLE = 0.15
 """A hole that is larger than this share of the mask is one of the object."""

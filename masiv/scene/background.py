@@ -68,11 +68,19 @@ class BackgroundModel:
         empty = self.backgrounds[view]
         picture = _with_light_of(image.astype(np.float32), empty)
         far = self._log_odds(picture, empty, self.noise.far, _CAST_SD)[0]
-        coarse = largest_components(cv2.GaussianBlur(far, (0, 0), 1.5) > 0)
-        log_odds = far
-        if coarse.any():
-            near = cv2.dilate(coarse.astype(np.uint8), np.ones((_NEAR, _NEAR), np.uint8)) > 0
-            log_odds = np.where(near, self._log_odds(picture, empty, self.noise.near, _CAST_SD_NEAR)[0], far)
+        coarse = largest_components(_blur(far, 1.5) > 0)
+        if not coarse.any():
+            return np.zeros(coarse.shape, np.float32)
+        near = cv2.dilate(coarse.astype(np.uint8), np.ones((_NEAR, _NEAR), np.uint8))
+        x, y, width, height = cv2.boundingRect(near)
+        window = (slice(y, y + height), slice(x, x + width))
+        mask = np.zeros(coarse.shape, np.float32)
+        mask[window] = self._near_object(picture[window], empty[window], far[window], near[window] > 0)
+        return mask
+
+    def _near_object(self, picture: np.ndarray, empty: np.ndarray, far: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """``mask`` in a window around the object. ``far``: log-odds by the noise far from it; ``near`` bool."""
+        log_odds = np.where(near, self._log_odds(picture, empty, self.noise.near, _CAST_SD_NEAR)[0], far)
         evidence = (np.clip(log_odds, -_CLIP, _CLIP) + self.prior) / self.correlated_pixels
         probability = smooth_labels(evidence.astype(np.float32), picture)
         kept = cv2.dilate(largest_components(probability > 0.5).astype(np.uint8), np.ones((3, 3), np.uint8))

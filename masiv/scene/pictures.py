@@ -20,7 +20,7 @@ from masiv.scene.lens import Lens
 from masiv.scene.scene import Frame
 
 OCCLUDER_ALPHA = 50
-MAX_LEARNT, MAX_LEARNT_A_VIEW = 72, 6
+MAX_LEARNT, MAX_LEARNT_A_VIEW = 48, 6
 """Pictures from which the noise and the light of a recording are learnt, in all and of one view."""
 Key = tuple[int, int]  # camera index, frame
 
