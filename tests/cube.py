@@ -44,6 +44,7 @@ class Seen:
 
     def __init__(self, positions, times, volume):
         self.positions, self.times, self.volume = positions, times, volume
+        self.volume_log_sd = float("nan")
 
     def evaluate(self, times):
         exact = np.asarray(times) * FPS
