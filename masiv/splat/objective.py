@@ -223,10 +223,17 @@ class Objective:
     def _image_loss(
         self, rgb: torch.Tensor, alpha: torch.Tensor, observed: ObservedImage, background: torch.Tensor
     ) -> torch.Tensor:
-        """(1 - l) L1 + l (1 - SSIM) over the background, plus L1 of alpha and mask. Occluded pixels have no error."""
-        c = self.config
-        target = observed.colour + (1 - observed.mask)[..., None] * background
-        rgb = torch.lerp(target, rgb, observed.valid[..., None])
+        """(1 - l) L1 + l (1 - SSIM) over the background, plus L1 of alpha and mask. Occluded pixels have no error.
+
+        If the mask was estimated from a picture of the empty scene, every other image is compared over that scene.
+        """
+        c, behind = self.config, observed.background
+        if behind is None or float(background[0]) < 0.5:
+            target = observed.colour + (1 - observed.mask)[..., None] * background
+            rgb = torch.lerp(target, rgb, observed.valid[..., None])
+        else:  # the picture as it is, without its mask
+            target = behind.picture
+            rgb = torch.lerp(target, rgb + (1 - alpha)[..., None] * (behind.empty - background), behind.near[..., None])
         absolute = (rgb - target).abs().mean()
         silhouette = ((alpha - observed.mask) * observed.valid).abs().mean()
         return (1 - c.ssim_weight) * absolute + c.ssim_weight * (1 - ssim(rgb, target)) + c.alpha_weight * silhouette

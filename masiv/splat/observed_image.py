@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import overload
 
+import cv2
 import numpy as np
 import torch
 
@@ -15,6 +16,9 @@ from masiv.errors import MasivError
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 from masiv.splat.config import ReconstructConfig
+
+_NEAR_PIXELS = 3
+"""An estimated outline is off by less than this [averaged pixels]."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +35,25 @@ class ObservedDepth:
 
 
 @dataclass(frozen=True)
+class ObservedBackground:
+    """What is behind the object; float32 tensors.
+
+    picture (H, W, 3): the image with its background. empty (H, W, 3): the scene without the object. near (H, W): 1 on
+    the object and next to it, where nothing else is expected to differ from the empty scene.
+    """
+
+    picture: torch.Tensor
+    empty: torch.Tensor
+    near: torch.Tensor
+
+
+@dataclass(frozen=True)
 class ObservedImage:
     """One image of the object; float32 tensors.
 
     view: index of the camera among those that are fitted. camera: of the crop. colour (H, W, 3) in [0, 1], multiplied
     by the mask. mask (H, W) in [0, 1]. valid (H, W): the fraction of a pixel that no occluder hides. depth:
-    measured depth of the object, if the recording has any.
+    measured depth of the object, if the recording has any. background: if the mask was estimated from it.
     """
 
     view: int
@@ -45,12 +62,17 @@ class ObservedImage:
     mask: torch.Tensor
     valid: torch.Tensor
     depth: ObservedDepth | None = None
+    background: ObservedBackground | None = None
 
     @property
-    def tensors(self) -> list[torch.Tensor]:
-        """colour, mask, valid; with depth, its values, noise and known pixels."""
-        depth = [] if self.depth is None else [self.depth.values, self.depth.noise, self.depth.known]
-        return [self.colour, self.mask, self.valid, *depth]
+    def tensors(self) -> list[list[torch.Tensor]]:
+        """colour, mask and valid; those of depth; those of the background: empty lists if there is none."""
+        d, b = self.depth, self.background
+        return [
+            [self.colour, self.mask, self.valid],
+            [] if d is None else [d.values, d.noise, d.known],
+            [] if b is None else [b.picture, b.empty, b.near],
+        ]
 
 
 class StoredImages(Sequence[ObservedImage]):
@@ -58,7 +80,10 @@ class StoredImages(Sequence[ObservedImage]):
 
     def __init__(self, file: ArrayFile, images: Iterable[ObservedImage]) -> None:
         self._file = file
-        self._images = [(image.view, image.camera, [file.append(t.numpy()) for t in image.tensors]) for image in images]
+        self._images = [
+            (image.view, image.camera, [[file.append(t.numpy()) for t in group] for group in image.tensors])
+            for image in images
+        ]
 
     def __len__(self) -> int:
         return len(self._images)
@@ -71,8 +96,14 @@ class StoredImages(Sequence[ObservedImage]):
         if isinstance(index, slice):
             return [self[k] for k in range(*index.indices(len(self)))]
         view, camera, stored = self._images[index]
-        pixels = [torch.from_numpy(self._file.read(array)) for array in stored]
-        return ObservedImage(view, camera, *pixels[:3], depth=ObservedDepth(*pixels[3:]) if pixels[3:] else None)
+        pixels, depth, behind = ([torch.from_numpy(self._file.read(array)) for array in group] for group in stored)
+        return ObservedImage(
+            view,
+            camera,
+            *pixels,
+            depth=ObservedDepth(*depth) if depth else None,
+            background=ObservedBackground(*behind) if behind else None,
+        )
 
 
 def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[int]) -> list[StoredImages]:
@@ -110,7 +141,17 @@ def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_
     window = (slice(y0, y0 + height * factor), slice(x0, x0 + width * factor))
     valid = picture.valid[window].astype(np.float32)
     mask = picture.mask[window] * valid
-    colour = picture.image[window].astype(np.float32) / 255 * mask[..., None]
+    whole, empty = picture.image[window].astype(np.float32) / 255, _empty_scene(scene, view)
+    # A pixel at the outline of an estimated mask is I = a F + (1 - a) B: its part of the object is a F.
+    colour = whole * mask[..., None]
+    behind = None
+    if empty is not None:
+        colour = np.clip(whole - (1 - mask[..., None]) * empty[window], 0, mask[..., None])
+        reach = np.ones((2 * _NEAR_PIXELS * factor + 1,) * 2, np.uint8)
+        near = cv2.dilate((picture.mask[window] > 0.1).astype(np.uint8), reach).astype(np.float32) * valid
+        behind = ObservedBackground(
+            *(torch.from_numpy(_average(pixels, factor)) for pixels in (whole, empty[window], near))
+        )
     visible = _average(valid, factor)
     divisor = np.maximum(visible, 1e-6)
     return ObservedImage(
@@ -120,7 +161,14 @@ def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_
         torch.from_numpy(_average(mask, factor) / divisor),
         torch.from_numpy(visible),
         None if picture.depth is None else _observed_depth(scene, picture.depth[window], mask, factor),
+        behind,
     )
+
+
+def _empty_scene(scene: Scene, view: int) -> np.ndarray | None:
+    """The background (H, W, 3) in [0, 1] from which masks of ``view`` were estimated."""
+    empty = scene.background(view) if scene.masks_estimated else None
+    return None if empty is None else empty.astype(np.float32) / 255
 
 
 def _observed_depth(scene: Scene, depth: np.ndarray, mask: np.ndarray, factor: int) -> ObservedDepth | None:
