@@ -28,6 +28,9 @@ _SHADOW_PRIOR, _DEEPEST_SHADOW = 0.15, 0.7
 _CAST_SD, _CAST_SD_NEAR = 2.0, 3.0
 """Standard deviation of the colour of a shadow about the scene's mean cast [grey levels], and near the object, which
 throws its own colour into its shadow. Measured on path-traced scenes: 2 and 3 grey levels."""
+_SHADOW_BLUR = 0.8
+"""Standard deviation of the window in which the depth of a shadow is fitted [pixels]. A shadow has a sharp edge where
+the object touches the ground. From 1.5 to 0.5 pixels the masks of five scenes change by 1 to 2 % of their area."""
 _OUTLIER_SHARE = 0.3
 """Share of the object's colours that the histogram may not contain, since no confident pixel shows them."""
 _CLIP = 10.0
@@ -98,7 +101,8 @@ class BackgroundModel:
         """Log-odds (H, W) of the object before its prior, and the probability of shadow among background."""
         light = _log_student(picture - empty, covariance) + math.log(1 - _SHADOW_PRIOR)
         shade = empty * self.shadow_cast
-        depth = _blur((shade * (empty - picture)).sum(-1), 1.5) / np.maximum(_blur((shade * shade).sum(-1), 1.5), 1.0)
+        taken = _blur((shade * (empty - picture)).sum(-1), _SHADOW_BLUR)
+        depth = taken / np.maximum(_blur((shade * shade).sum(-1), _SHADOW_BLUR), 1.0)
         shaded = empty - shade * np.clip(depth, 0.0, _DEEPEST_SHADOW)[..., None]
         # The depth of a shadow is fitted: its density is spread over the colours that a shadow can give.
         spread = _DEEPEST_SHADOW * np.linalg.norm(empty, axis=-1) / math.sqrt(2 * math.pi * np.trace(covariance) / 3)
