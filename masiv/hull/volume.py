@@ -43,11 +43,6 @@ class VolumePrior:
         """One standard deviation below the median [m³]."""
         return self.volume * float(np.exp(-self.log_sd))
 
-    @property
-    def upper(self) -> float:
-        """One standard deviation above the median [m³]."""
-        return self.volume * float(np.exp(self.log_sd))
-
 
 def volume_prior(scene: Scene, hulls: dict[int, VisualHull]) -> VolumePrior:
     """The volume of the object from the ``hulls`` of some frames, carved in the cameras of ``scene``."""

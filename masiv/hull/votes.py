@@ -16,7 +16,7 @@ from masiv.hull.silhouette import Silhouette
 from masiv.scene.scene import Ground
 
 FEWEST_VIEWS = 5
-"""Fewer views cannot outvote one: with four, the part of a hull that one view denies is seldom needed by two others."""
+"""Fewer views have a veto each: with four, three others seldom see enough of a part to need it."""
 _VETO = 0.5
 """Confidence of the views against a voxel, summed, that removes it from the hull."""
 _LARGEST_MINORITY = 1.5

@@ -7,8 +7,9 @@ import numpy as np
 
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _COUPLING, _EDGE_SHARE = 1.0, 0.7
-"""Log-odds that a neighbour of the same label adds in a smooth region, and the share of it that an edge removes. On
-synthetic scenes the masks change by less than 1 % of their area for couplings from 0.7 to 1.5."""
+"""Log-odds that a neighbour of the same label adds in a smooth region, and the share of it that an edge removes. Both
+are a debt: set by hand. Intersection over union of the masks of two noisy scenes rose by 0.001 to 0.02 from a coupling
+of 0.3 to 1."""
 _ITERATIONS = 12
 
 
