@@ -23,8 +23,8 @@ _ROUNDS = 2
 _LARGEST_HOLE = 0.15
 """A hole that is larger than this share of the mask is one of the object."""
 _CLOSING = 0.15
-"""Width of the mouth of a bay that counts as a hole, over the square root of the mask's area. A debt, as the sizes above
-and below: set by hand on noisy pictures of three scenes."""
+"""Width of the mouth of a bay that counts as a hole, over the square root of the mask's area. A debt, as the sizes
+above and below: set by hand on noisy pictures of three scenes."""
 _COVERED = 0.9
 """Share of a hole that the hull of the other views covers, if it is a defect of the mask."""
 _SUPPORT = 2.0
