@@ -77,7 +77,7 @@ def run(scene: Path, out: Path, cameras: int, faults: str) -> None:
     if not (data / "all_data.json").is_file():
         shutil.rmtree(data, ignore_errors=True)
         degrade(scene, data, cameras, faults)
-    masiv = [sys.executable, "-m", "masiv"]
+    masiv = [sys.executable, "-m", "masiv.cli.main"]
     arguments = ["--out", str(folder), "--preset", "quick", "--fit-frames", "12"]
     subprocess.run([*masiv, "identify", str(data), *arguments], check=True)
     subprocess.run([*masiv, "evaluate", str(folder), "--truth", str(scene / "gt")], check=True)
