@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from masiv.hull.distance import distance_to_zero
 from masiv.hull.silhouette import Silhouette
 from masiv.scene.depth import back_projected
 from masiv.scene.scene import Scene
@@ -113,11 +114,11 @@ def local_thickness(mask: np.ndarray) -> np.ndarray:
     section.
     """
     padded = cv2.copyMakeBorder(mask.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    edge = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    edge = distance_to_zero(padded)
     radius = np.zeros_like(edge)
     for level in np.linspace(edge.max(), 0.5, _LEVELS):
         centres = (edge >= level).astype(np.uint8)
-        near = cv2.distanceTransform(1 - centres, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= level
+        near = distance_to_zero(1 - centres) <= level
         radius = np.where((radius == 0) & near & (padded > 0), level, radius)
     radius = np.maximum(radius, edge)
     return 2 * np.sqrt(np.maximum(radius**2 - (radius - edge) ** 2, 0.0))[1:-1, 1:-1]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from masiv.hull.distance import distance_to_zero
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 
@@ -93,10 +94,10 @@ def signed_distance(mask: np.ndarray) -> np.ndarray:
     diagonal = float(np.hypot(*mask.shape))
     if not on.any():
         return np.full(mask.shape, diagonal, np.float32)
-    outwards = cv2.distanceTransform(1 - on, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outwards = distance_to_zero(1 - on)
     # The object may continue beyond the border, so the border is not an edge of the mask.
     padded = cv2.copyMakeBorder(on, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    inwards = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    inwards = distance_to_zero(padded)[1:-1, 1:-1]
     return np.where(on > 0, 0.5 - np.minimum(inwards, diagonal), outwards - 0.5).astype(np.float32)
 
 
