@@ -112,3 +112,16 @@ def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers
     assert whole.fit == resumed.fit
     for name, value in whole.law.state_dict().items():
         assert torch.equal(value, resumed.law.state_dict()[name])
+
+
+def test_a_result_is_replaced_only_if_it_is_better_by_more_than_a_standard_error():
+    """Paired by frame: differences that all frames share count, differences within their scatter do not."""
+    before = torch.tensor([0.2, 0.4, 0.6, 0.8])
+    scatter = torch.tensor([0.1, -0.1, 0.1, -0.1])
+    clearly = surface_finetune.is_clearly_lower
+    assert clearly(before - 0.01, before)
+    assert clearly(before - 0.06 + scatter, before)  # the standard error is 0.058
+    assert not clearly(before - 0.05 + scatter, before)
+    assert not clearly(before, before)
+    assert not clearly(before + 0.01, before)
+    assert clearly(before[:1] - 0.01, before[:1])

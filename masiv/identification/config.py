@@ -66,7 +66,7 @@ class IdentifyConfig(BaseModel):
     surface_finetune: bool = Field(
         True,
         description="after the fit to paths, half as many iterations on surfaces and pictures; the result is kept if "
-        "it is nearer to the pictures",
+        "it is nearer to the pictures by more than a standard error",
     )
     trajectory_weight: float = Field(1.0, ge=0, description="weight of the geometry loss")
     silhouette_weight: float = Field(0.2, ge=0, description="weight of the silhouettes in the fit to paths")

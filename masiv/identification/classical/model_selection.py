@@ -41,7 +41,8 @@ def image_losses(objective: Objective, fits: Sequence[FamilyFit]) -> dict[str, f
 
     def loss(fit: FamilyFit) -> float:
         try:
-            return float(finetune.image_loss(finetune.rollout_image_errors(fit.law, fit.initial_state, fit.contact)))
+            errors = finetune.rollout_image_errors(fit.law, fit.initial_state, fit.contact)
+            return float(finetune.image_loss(errors).mean())
         except NonFiniteError:
             return math.inf
 

@@ -72,21 +72,28 @@ class ImageTerms:
         _ = self.splat_sigma, self.colors
 
     def errors(self, positions: torch.Tensor, pictures: Iterable[tuple[int, int]]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean silhouette error () and mean color error () over ``pictures`` (frame, view).
+        """Mean silhouette error () and mean color error () over ``pictures``, as ``errors_by_picture``."""
+        silhouettes, colors = self.errors_by_picture(positions, pictures)
+        return silhouettes.mean(), colors.mean()
+
+    def errors_by_picture(
+        self, positions: torch.Tensor, pictures: Iterable[tuple[int, int]]
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Silhouette errors (P,) and color errors (P,) of ``pictures`` (frame, view).
 
         Silhouettes: sum of |alpha - mask| over the area of the mask. Colors: ``color_correlation_loss``.
         positions (K, N, 3) [m, simulation frame] as ``FilmedBody.run`` returns them.
         """
         parts = [(d.abs().sum() / area, color) for d, area, color in self._compared(positions, pictures)]
         silhouettes, colors = zip(*parts, strict=True)
-        return torch.stack(silhouettes).mean(), torch.stack(colors).mean()
+        return torch.stack(silhouettes), torch.stack(colors)
 
     def residuals(
         self, positions: torch.Tensor, pictures: Iterable[tuple[int, int]]
     ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """For each picture alpha - mask (H, W), divided by the root of the mask's area, and the color error ().
 
-        Arguments as of ``errors``.
+        Arguments as of ``errors_by_picture``.
         """
         for difference, area, color in self._compared(positions, pictures):
             yield difference / math.sqrt(area), color

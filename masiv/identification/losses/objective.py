@@ -91,7 +91,7 @@ class Objective:
         return chamfer_error(simulated, observed)
 
     def image_loss(self, errors: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
-        """w_sil L_sil + w_col L_col of the mean ``errors`` of silhouettes and colors."""
+        """w_sil L_sil + w_col L_col of the ``errors`` of silhouettes and colors, of any one shape."""
         return self.config.silhouette_weight * errors[0] + self.config.color_weight * errors[1]
 
     def loss(self, geometry_error: torch.Tensor, image_errors: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
@@ -112,12 +112,12 @@ class Objective:
     def rollout_image_errors(
         self, law: Law, initial_state: InitialState, contact: str
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean errors () of silhouettes and colors of a rollout in ``VIEWS_COMPARED`` pictures of each frame.
+        """Errors of silhouettes (T,) and colors (T,) of a rollout, means of ``VIEWS_COMPARED`` pictures of each frame.
 
         Raises NonFiniteError if the rollout diverges.
         """
         problem = self.problem
         positions = problem.run(law, initial_state, contact, problem.frames)
-        return self.images.errors(
-            positions, pictures_of_each_frame(problem.scene.views, problem.frames, VIEWS_COMPARED)
-        )
+        pictures = pictures_of_each_frame(problem.scene.views, problem.frames, VIEWS_COMPARED)
+        silhouettes, colors = self.images.errors_by_picture(positions, pictures)
+        return silhouettes.reshape(problem.frames, -1).mean(1), colors.reshape(problem.frames, -1).mean(1)

@@ -7,6 +7,7 @@ drift.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -31,7 +32,8 @@ def finetune_surfaces(
 ) -> tuple[TrainingResult, float, dict[str, float]]:
     """Continue from ``trained``, a neural law, with half as many iterations on surfaces and pictures.
 
-    Returns the one of the two results with the lower image loss, its image loss, and the image errors of both.
+    Returns the new result if its image loss is clearly lower (``is_clearly_lower``), else ``trained``; its image loss;
+    and the image errors of both.
     """
     path_iterations = recordings[0].objective.config.iterations
     objectives = [r.objective.with_surface_loss(path_iterations // 2) for r in recordings]
@@ -45,23 +47,37 @@ def finetune_surfaces(
     )  # fmt: skip
     finetuned.history = [*trained.history, *((i + path_iterations, *row) for i, *row in finetuned.history)]
     errors = {
-        name: _mean_image_errors(objectives, result, contact)
+        name: _image_errors(objectives, result, contact)
         for name, result in (("paths", trained), ("surfaces", finetuned))
     }
-    report = {f"silhouette_error_of_{name}": float(silhouette) for name, (silhouette, _) in errors.items()}
+    report = {f"silhouette_error_of_{name}": float(silhouette.mean()) for name, (silhouette, _) in errors.items()}
     if objectives[0].images.colors is not None:
-        report |= {f"color_error_of_{name}": float(color) for name, (_, color) in errors.items()}
-    before, after = (float(objectives[0].image_loss(e)) for e in errors.values())
-    return (finetuned, after, report) if after < before else (trained, before, report)
+        report |= {f"color_error_of_{name}": float(color.mean()) for name, (_, color) in errors.items()}
+    before, after = (objectives[0].image_loss(e) for e in errors.values())
+    if is_clearly_lower(after, before):
+        return finetuned, float(after.mean()), report
+    return trained, float(before.mean()), report
 
 
-def _mean_image_errors(
+def is_clearly_lower(after: torch.Tensor, before: torch.Tensor) -> bool:
+    """Whether the mean of losses (T,) ``after`` is lower than that of ``before`` by a standard error of the difference.
+
+    The losses are paired: of the same frames. The one-standard-error rule (Breiman et al., Classification and
+    Regression Trees, 1984, section 3.4.3): a difference within its standard error is no reason to leave the first one.
+    """
+    difference = (after - before).double()
+    count = len(difference)
+    standard_error = float(difference.std()) / math.sqrt(count) if count > 1 else 0.0
+    return float(difference.mean()) < -standard_error
+
+
+def _image_errors(
     objectives: Sequence[Objective], trained: TrainingResult, contact: str
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean errors () of silhouettes and colors over all recordings."""
+    """Errors (T,) of silhouettes and of colors, of the frames of all recordings."""
     errors = [
         objective.rollout_image_errors(trained.law, state, contact)
         for objective, state in zip(objectives, trained.initial_states, strict=True)
     ]
     silhouettes, colors = zip(*errors, strict=True)
-    return torch.stack(silhouettes).mean(), torch.stack(colors).mean()
+    return torch.cat(silhouettes), torch.cat(colors)
