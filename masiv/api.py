@@ -74,8 +74,11 @@ def reconstruct(scene: Scene, config: Config | None = None, *, progress: Progres
 
 
 def calibrated(scene: Scene, gaussians: DynamicGaussians) -> Scene:
-    """``scene`` with the cameras that were refined with ``gaussians``; as it is if none were, or if it has them."""
-    return scene if gaussians.calibration is None else gaussians.calibration.applied_to(scene)
+    """``scene`` as the steps after ``reconstruct`` see it: with the cameras that were refined with ``gaussians``, and,
+    if its masks were estimated from colours, with the masks that the Gaussians have."""
+    from masiv.splat.rendered_masks import as_reconstructed
+
+    return as_reconstructed(scene, gaussians)
 
 
 def estimate_trajectory(
@@ -83,7 +86,7 @@ def estimate_trajectory(
 ) -> Trajectory:
     """Fill the object with particles and follow them: ``positions`` (T, Q, 3) [m] at ``times`` (T,) [s].
 
-    The cameras of ``scene`` are those that were refined with ``gaussians``, if any were.
+    Cameras and masks are those of ``calibrated``.
     """
     from masiv.continuum.trajectory import estimate_trajectory as stage
 

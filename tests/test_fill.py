@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from still import still
 
 from masiv.continuum.config import TrajectoryConfig
-from masiv.continuum.fill import DensityField, depth_in_front, even_points, fill_volume
+from masiv.continuum.fill import DensityField, density_field, depth_in_front, even_points, fill_volume
 from masiv.errors import MasivError
 
 CENTRE, RADIUS = np.array([0.05, 0.45, 0.0]), 0.25
@@ -43,6 +43,14 @@ def test_sphere_is_filled_to_its_volume():
     # solid, not a shell: as dense in the middle as anywhere
     middle = (np.linalg.norm(filled.points - CENTRE, axis=1) < 0.5 * RADIUS).sum() * filled.spacing**3
     assert middle == pytest.approx(4 / 3 * np.pi * (0.5 * RADIUS) ** 3, rel=0.08)
+
+
+def test_particles_stand_for_the_volume_of_the_field():
+    """The field falls through one half at its surface, also between the last voxel inside and the first one outside."""
+    scene = spheres_scene(lambda frame: [(CENTRE, RADIUS)], cameras=ring(16))
+    field = density_field(scene, None, 0, CONFIG)
+    points = even_points(field, 0.4 * field.spacing)
+    assert len(points) * (0.4 * field.spacing) ** 3 == pytest.approx(field.volume, rel=0.02)
 
 
 def test_given_spacing_is_used():

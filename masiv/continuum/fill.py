@@ -108,8 +108,7 @@ def density_field(
 
     volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``. prior: of the object's volume.
     The depth of a surface that was fitted to noisy pictures is biased. If so much is carved that the volume is
-    improbable, the depth counts less: its tolerance grows until the volume is one standard deviation below the prior's
-    median.
+    improbable (``VolumePrior.lower``), the depth counts less: its tolerance grows until the volume is not.
     """
     if scene.load_cloud is not None:
         return cloud_volume(
@@ -133,7 +132,9 @@ def density_field(
         density = np.zeros(index.max(axis=0) + 1 + margin, np.float32)
         density[tuple(index.T)] = filled if empty is None else np.where(empty, 0.0, filled)
         density = ndimage.uniform_filter(density, size=3, mode="constant")
-        density[~_main_pieces(density > 0.5)] = 0.0
+        # What is outside keeps its density: the surface of the interpolated field is where it falls to one half.
+        solid = density > 0.5
+        density[solid & ~_main_pieces(solid)] = 0.0
         return DensityField(density, lower, spacing)
 
     if dynamic is None:

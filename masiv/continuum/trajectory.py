@@ -109,7 +109,8 @@ def estimate_trajectory(
     prior = known_volume(scene, config)
     start = fill_first_frame(scene, dynamic, config, prior)
     hull = hull_volume(scene, config)
-    same = None if prior is None else replace(prior, volume=start.volume)
+    # A body keeps its volume. So it is known more closely in the frames after the first: to half of that, an estimate.
+    same = None if prior is None else replace(prior, volume=start.volume, log_sd=prior.log_sd / 2)
     volumes = []
     for frame in range(1, scene.frame_count):
         progress("fill", frame, scene.frame_count - 1)

@@ -40,8 +40,8 @@ class VolumePrior:
 
     @property
     def lower(self) -> float:
-        """One standard deviation below the median [m³]."""
-        return self.volume * float(np.exp(-self.log_sd))
+        """Two standard deviations below the median [m³]: a smaller volume is improbable (2.3 %)."""
+        return self.volume * float(np.exp(-2 * self.log_sd))
 
 
 def volume_prior(scene: Scene, hulls: dict[int, VisualHull]) -> VolumePrior:

@@ -32,9 +32,14 @@ def calibrated_scene(run: RunFolder, scene: Scene) -> Scene:
 
 
 def training_scene(run: RunFolder, scene: Scene) -> Scene:
-    """``scene`` without held-out frames and cameras: what a stage that fits may see. Its cameras are the refined ones
-    once there are any."""
-    return calibrated_scene(run, scene).restricted(run.fit_frames, run.holdout_cameras)
+    """``scene`` without held-out frames and cameras: what a stage that fits may see. Once there are Gaussians, its
+    cameras are those that were refined with them, and masks that were estimated are theirs (``as_reconstructed``)."""
+    visible = scene.restricted(run.fit_frames, run.holdout_cameras)
+    if not run.done("reconstruct"):
+        return visible
+    from masiv.splat.rendered_masks import as_reconstructed
+
+    return as_reconstructed(visible, load_gaussians(run))
 
 
 def load_gaussians(run: RunFolder) -> DynamicGaussians:
@@ -136,6 +141,7 @@ def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, pro
     from masiv.continuum.trajectory import Trajectory
     from masiv.splat.dynamic import DynamicGaussians
     from masiv.splat.extend_frames import ExtendFramesConfig, extend_frames
+    from masiv.splat.rendered_masks import as_reconstructed
 
     folder = run.path / "held_out"
     path = folder / "trajectory.npz"
@@ -159,9 +165,10 @@ def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, pro
         extended.save(folder)
     checkpoint.clear()
     checkpoint = run.checkpoint("held_out_trajectory")
+    extended = DynamicGaussians.load(folder)
     trajectory = extend_trajectory(
-        visible,
-        DynamicGaussians.load(folder),
+        as_reconstructed(visible, extended),
+        extended,
         given,
         config.trajectory,
         seed=config.seed,
