@@ -8,8 +8,9 @@ from pathlib import Path
 
 from masiv.errors import InputError
 from masiv.scene.declaration import SceneDeclaration
-from masiv.scene.pictures import Pictures, crop_mask
+from masiv.scene.pictures import ESTIMATED, Pictures, crop_mask
 from masiv.scene.scene import Scene
+from masiv.scene.segmenter import VideoSegmenter
 
 MAX_LISTED = 8
 
@@ -56,6 +57,10 @@ def assemble(
         pictures = replace(pictures, depth_unit=declaration.depth_unit)
     if declaration.depth_noise is not None:
         pictures = replace(pictures, depth_noise=declaration.depth_noise.noise())
+    if declaration.masks is not None:
+        beside = folder.parent if folder.is_file() else folder
+        weights = beside / Path(declaration.masks.weights).expanduser()
+        pictures = pictures.with_segmenter(VideoSegmenter(weights), declaration.masks.boxes_by_view(cameras))
     source, more = pictures.mask_sources()
     return Scene(
         path=folder,
@@ -69,7 +74,7 @@ def assemble(
         density=declaration.density or conventions.density,
         load=pictures.load,
         mask_source=source,
-        masks_estimated=any(mask.kind in ("background", "plain") for mask in pictures.masks.values()),
+        masks_estimated=any(mask.kind in ESTIMATED for mask in pictures.masks.values()),
         background=pictures.background,
         problems=(*problems, *guesses(declaration, conventions), *gaps, *more, *pictures.depth_problems()),
         fit_frames=declaration.fit_frames,
