@@ -11,6 +11,7 @@ from masiv.config import Config
 from masiv.errors import InputError
 from masiv.files import write_json
 from masiv.observations.identity import identity
+from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
 from masiv.pipeline import stages
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
@@ -41,6 +42,8 @@ class VideoRun(Run):
         flags["reconstruct.refine_calibration"] = False if request.keep_calibration else None
         config = settings(overrides, existing.config if existing else None, **flags)
         read = read_scene(scene)
+        if existing:
+            read = with_kept_masks(read, existing.masks)
         for other in config.identify.also:
             config.identify.require_neural_for_several()
             if Path(other).resolve() == out.resolve():
@@ -52,7 +55,8 @@ class VideoRun(Run):
         cameras = tuple(sorted(set(request.holdout_camera))) or (existing.holdout_cameras if existing else ())
         read.restricted(fit_frames, cameras)
         asked = Request(config.model_dump(mode="json"), scene, identity(read), fit_frames, cameras)
-        return cls(RunFolder.create_or_resume(out, asked), config, read)
+        folder = RunFolder.create_or_resume(out, asked)
+        return cls(folder, config, read if existing else with_kept_masks(read, folder.masks))
 
     def reconstruct(self, progress: Progress = silent) -> Summary:
         dynamic = stages.ensure_gaussians(self.folder, self.config, self.scene, progress)

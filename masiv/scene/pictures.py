@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -97,9 +97,10 @@ class Pictures:
         masks = {key: source if key in chosen else known for key, known in self.masks.items()}
         return replace(self, masks=masks, segmenter=segmenter, boxes=boxes)
 
-    def load(self, view: int, frame: int) -> Frame:
+    def load(self, view: int, frame: int, mask: np.ndarray | None = None) -> Frame:
         """The picture of ``view`` at ``frame``. One that does not exist is black, and not valid anywhere.
 
+        mask (H, W) float32: of this picture, if it is known.
         Raises InputError if a file cannot be read or its size differs from that of its view.
         """
         camera = self.cameras[view]
@@ -112,7 +113,10 @@ class Pictures:
                 f"{path} has no alpha channel, unlike other pictures of {camera.name}: its mask is unknown"
             )
         depth = self._depth(view, self.depths.get((view, frame))) if self.depths else None
-        mask = self._mask(view, frame, image, depth)
+        if mask is None:
+            mask = self._mask(view, frame, image, depth)
+            if self.crops is not None:
+                mask = mask * self.crops[view]
         valid = np.ones(image.shape[:2], bool)
         if view in self.lenses:
             valid &= self.lenses[view].visible
@@ -120,8 +124,6 @@ class Pictures:
             occluder = self._read(view, self.occluders[view])
             if occluder.shape[-1] == 4:
                 valid &= occluder[..., 3] <= OCCLUDER_ALPHA
-        if self.crops is not None:
-            mask = mask * self.crops[view]
         if depth is not None:
             depth = np.where(valid, depth, np.float32(0))
         return Frame(image[..., :3], mask, valid, depth)
@@ -129,6 +131,18 @@ class Pictures:
     def background(self, view: int) -> np.ndarray | None:
         """The empty scene in ``view``, (H, W, 3) uint8, or None if there is no picture of it."""
         return self._read(view, self.backgrounds[view])[..., :3] if view in self.backgrounds else None
+
+    def mask_inputs(self) -> list[Any]:
+        """What the masks depend on, besides code: files by name, size and time of their last change, and lenses."""
+        named = [("picture", *key, path) for key, path in self.paths.items()]
+        named += [(mask.kind, *key, mask.path) for key, mask in self.masks.items()]
+        named += [("depth", *key, path) for key, path in self.depths.items()]
+        for kind in ("backgrounds", "occluders", "empty_depths"):
+            named += [(kind, view, -1, path) for view, path in getattr(self, kind).items()]
+        if self.segmenter is not None:
+            named += [("weights", -1, -1, path) for path in self.segmenter.files()]
+        files = [[kind, view, frame, *_file_state(path)] for kind, view, frame, path in named]
+        return [files, self.cameras, self.lenses]
 
     def mask_sources(self) -> tuple[str, list[str]]:
         """The description of the main source of the masks, and a problem for each other source."""
@@ -241,6 +255,13 @@ class Pictures:
                 f"{path} is {width}×{height}, the other pictures of its view are {camera.width}×{camera.height}"
             )
         return self.lenses[view].undistort(pixels) if view in self.lenses else pixels
+
+
+def _file_state(path: Path | None) -> list[str | int]:
+    if path is None:
+        return []
+    stat = path.stat()
+    return [path.resolve().as_posix(), stat.st_size, stat.st_mtime_ns]
 
 
 def read_pixels(path: Path) -> np.ndarray:

@@ -94,6 +94,10 @@ class VideoSegmenter:
                 f"scene.yaml: masks.weights: {config} is of a model of type {kind!r}: give one of type 'sam2_video'"
             )
 
+    def files(self) -> list[Path]:
+        """The files of the weights."""
+        return sorted(path for path in self.weights.iterdir() if path.is_file())
+
     @property
     def model(self) -> Any:
         """The network, ``transformers.Sam2VideoModel``. Raises InputError as ``check``, and for incomplete weights."""
