@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class KeptMasks:
 
     def write(self, name: str, masks: Mapping[int, np.ndarray]) -> None:
         """Keep ``masks`` (H, W) float32 by view under ``name``, compressed without loss."""
-        arrays = {str(view): mask for view, mask in masks.items()}
+        arrays: dict[str, Any] = {str(view): mask for view, mask in masks.items()}
         write_npz(self.folder / f"{name}.npz", key=self.key, **arrays)
 
 
