@@ -1,8 +1,8 @@
 """A tighter hull of a body that has a mirror plane: the part of the hull whose mirror image is in the hull, too.
 
-A body with a mirror plane is in its hull and in the mirror image of its hull, so it is in their intersection: cameras on
-one side carve the other one as well. The plane is right only if the intersection still explains the silhouettes, as the
-hull does.
+A body with a mirror plane is in its hull and in the mirror image of its hull, so it is in their intersection: each
+camera carves as if there were another one in its mirror image. The plane is right only if the intersection still
+explains the silhouettes, as the hull does.
 """
 
 from __future__ import annotations
@@ -33,6 +33,10 @@ class MirrorPlane:
 
     normal: np.ndarray
     offset: float
+
+    def __str__(self) -> str:
+        x, y, z = self.normal
+        return f"mirror plane ({x:.3f}, {y:.3f}, {z:.3f})·x = {self.offset:.4f} m"
 
     def mirrored(self, points: np.ndarray) -> np.ndarray:
         """Mirror images (N, 3) [m] of ``points`` (N, 3) [m]."""

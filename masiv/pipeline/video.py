@@ -89,8 +89,12 @@ class VideoRun(Run):
         }
         text = f"{self.folder.trajectory}: {particles} particles, {frames} frames, {made.spacing * 1e3:.1f} mm apart"
         data["volume_log_sd"] = made.volume_log_sd if math.isfinite(made.volume_log_sd) else None
+        plane = ""
+        if made.mirror is not None:
+            data["mirror_plane"] = {"normal": made.mirror.normal.tolist(), "offset_m": made.mirror.offset}
+            plane = f", {made.mirror}"
         error = "" if math.isnan(made.volume_log_sd) else f" ± {made.volume * made.volume_log_sd * 1e3:.2f}"
-        return Summary(data, f"{text}, {made.volume * 1e3:.2f}{error} litres")
+        return Summary(data, f"{text}, {made.volume * 1e3:.2f}{error} litres{plane}")
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
