@@ -13,6 +13,8 @@ from ring_scene import ring
 
 from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
+from masiv.pipeline.run import open_run
+from masiv.pipeline.video import VideoRun
 from masiv.scene.scene import Frame
 
 
@@ -128,6 +130,18 @@ def test_a_damaged_file_is_made_again(folder, kept, damage):
         assert_same(all_frames(with_kept_masks(read_scene(folder), kept)), expected)
     mark(kept)
     assert is_marked(with_kept_masks(read_scene(folder), kept))
+
+
+def test_a_run_keeps_its_masks_once_a_stage_asks_for_them(folder, tmp_path):
+    run = open_run(folder, tmp_path / "run")
+    assert isinstance(run, VideoRun)
+    assert not (run.path / "masks").exists()
+    expected = all_frames(run.scene)
+    assert_same(expected, all_frames(read_scene(folder)))
+    mark(run.path / "masks")
+    again = open_run(folder, tmp_path / "run")
+    assert isinstance(again, VideoRun)
+    assert is_marked(again.scene)
 
 
 def test_given_masks_are_not_kept(tmp_path, kept):

@@ -94,7 +94,8 @@ def mirror_plane(hull: VisualHull, normal: np.ndarray | None = None) -> MirrorPl
 
     def best_shift(direction: np.ndarray, around: float, half_width: float) -> tuple[float, float]:
         """(overlap, shift) of the best of nine shifts [m]."""
-        return max((score(direction, s), -abs(s), s) for s in around + half_width * np.linspace(-1, 1, 9))[::2]
+        found, _, shift = max((score(direction, s), -abs(s), s) for s in around + half_width * np.linspace(-1, 1, 9))
+        return found, shift
 
     if normal is not None:
         direction = np.asarray(normal, np.float64) / np.linalg.norm(normal)

@@ -42,8 +42,6 @@ class VideoRun(Run):
         flags["reconstruct.refine_calibration"] = False if request.keep_calibration else None
         config = settings(overrides, existing.config if existing else None, **flags)
         read = read_scene(scene)
-        if existing:
-            read = with_kept_masks(read, existing.masks)
         for other in config.identify.also:
             config.identify.require_neural_for_several()
             if Path(other).resolve() == out.resolve():
@@ -56,7 +54,7 @@ class VideoRun(Run):
         read.restricted(fit_frames, cameras)
         asked = Request(config.model_dump(mode="json"), scene, identity(read), fit_frames, cameras)
         folder = RunFolder.create_or_resume(out, asked)
-        return cls(folder, config, read if existing else with_kept_masks(read, folder.masks))
+        return cls(folder, config, with_kept_masks(read, folder.masks))
 
     def reconstruct(self, progress: Progress = silent) -> Summary:
         dynamic = stages.ensure_gaussians(self.folder, self.config, self.scene, progress)
