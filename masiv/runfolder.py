@@ -31,6 +31,7 @@ SECTIONS = {
     "trajectory": ("trajectory",),
     "identify": ("simulator", "identify", "tracks"),
 }
+MASKS = "masks"  # folder of masks that were estimated
 PENDING, RUNNING, DONE = "pending", "running", "done"
 
 
@@ -99,6 +100,10 @@ class RunFolder:
     @property
     def holdout_cameras(self) -> tuple[int, ...]:
         return tuple(self.record["split"]["holdout_cameras"])
+
+    @property
+    def masks(self) -> Path:
+        return self.path / MASKS
 
     @property
     def trajectory(self) -> Path:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from masiv.continuum.finetune import chamfer_targets
 from masiv.continuum.losses import below_ground, field_terms, load_views, outside_of_mask, stencil
 from masiv.continuum.trajectory import Trajectory, estimate_trajectory
 from masiv.errors import InputError
+from masiv.hull.symmetry import MirrorPlane
 from masiv.scene.scene import Ground
 
 RADIUS, SHIFT = 0.22, np.array([0.06, -0.02, 0.03])
@@ -102,11 +105,13 @@ def test_interrupted_and_resumed_is_uninterrupted(scene, dynamic, tmp_path):
 
 def test_saved_trajectory_evaluates_alone(scene, dynamic, tmp_path):
     result = estimate_trajectory(scene, dynamic, CONFIG.model_copy(update={"carve_images": 99, "iterations": 10}))
+    result = replace(result, mirror=MirrorPlane(np.array([0.0, 0.6, 0.8]), 0.1))
     result.save(tmp_path / "trajectory.npz")
     loaded = Trajectory.load(tmp_path / "trajectory.npz")
     times = np.array([0.01, 0.055])
     np.testing.assert_array_equal(loaded.evaluate(times), result.evaluate(times))
     assert (loaded.spacing, loaded.volume) == (result.spacing, result.volume)
+    assert str(loaded.mirror) == "mirror plane (0.000, 0.600, 0.800)·x = 0.1000 m"
     assert [path.name for path in tmp_path.iterdir()] == ["trajectory.npz"]
     (tmp_path / "broken.npz").write_bytes(b"PK not a zip")
     with pytest.raises(InputError, match=r"broken\.npz"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 
 class TrajectoryConfig(BaseModel):
@@ -12,6 +14,11 @@ class TrajectoryConfig(BaseModel):
 
     particle_count: int = Field(6000, ge=100, description="approximate number of particles that fill the object")
     fill_resolution: int = Field(72, ge=16, le=256, description="voxels along the longest side of the filled box")
+    symmetry: Literal["none", "auto"] | tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
+        "none",
+        description="mirror plane of the body at frame 0: its normal (world axes), auto (searched for) or none; the "
+        "filled hull is cut to the part whose mirror image is in the hull",
+    )
     depth_tolerance: float = Field(1.5, gt=0, description="voxels in front of a rendered surface that stay filled")
     carve_tolerance: float = Field(4.0, gt=0, description="pixels outside of a mask that count against a particle")
     carve_images: int = Field(8, ge=1, description="images (view and frame) against a particle that remove it")
@@ -26,3 +33,10 @@ class TrajectoryConfig(BaseModel):
     volume_weight: float = Field(1.0, ge=0, description="change of volume")
     rigidity_weight: float = Field(0.02, ge=0, description="strain; small, since the material may flow")
     ground_weight: float = Field(10.0, ge=0, description="depth of particles below the ground")
+
+    @field_validator("symmetry")
+    @classmethod
+    def _a_direction(cls, value: object) -> object:
+        if isinstance(value, tuple) and not any(value):
+            raise ValueError("the normal of a mirror plane must not be zero")
+        return value

@@ -21,6 +21,7 @@ from masiv.hull.carve import visual_hull
 from masiv.hull.depth import depth_views
 from masiv.hull.shadow_volume import remove_shadow_volume
 from masiv.hull.silhouette import Silhouette, sample_bilinear, silhouettes
+from masiv.hull.symmetry import MirrorPlane, symmetric_hull
 from masiv.hull.volume import VolumePrior
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
@@ -101,12 +102,14 @@ def density_field(
     *,
     volume: float | None = None,
     prior: VolumePrior | None = None,
+    mirror: MirrorPlane | None = None,
 ) -> DensityField:
     """Carve ``frame`` by its silhouettes and, with ``dynamic``, by the depth of the rendered surface; smooth it.
 
     Of a point cloud, the solid that it encloses or fills.
 
     volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``. prior: of the object's volume.
+    mirror: plane of symmetry of the object at this frame, if it is known.
     The depth of a surface that was fitted to noisy pictures is biased. If so much is carved that the volume is
     improbable (``VolumePrior.lower``), the depth counts less: its tolerance grows until the volume is not.
     """
@@ -117,6 +120,8 @@ def density_field(
     hull = visual_hull(scene, frame, resolution=config.fill_resolution)
     if volume is not None:
         hull = remove_shadow_volume(scene, frame, hull, volume)
+    if mirror is not None:
+        hull = symmetric_hull(hull, mirror)
     spacing = hull.spacing
     margin = 2
     lower = hull.points.min(axis=0) - margin * spacing

@@ -23,6 +23,8 @@ from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
 from masiv.files import write_npz
 from masiv.hull.carve import visual_hull
+from masiv.hull.silhouette import silhouettes
+from masiv.hull.symmetry import MirrorPlane, contradicting, mirror_plane, symmetric_hull
 from masiv.hull.velocity import with_velocities
 from masiv.hull.volume import VolumePrior, volume_prior
 from masiv.progress import Progress, silent
@@ -42,7 +44,8 @@ class Trajectory:
 
     positions (T, Q, 3) float32 [m, world] at times (T,) [s]; positions[0] is the canonical frame. Each particle has
     the volume spacing³ [m³]; volume = Q spacing³ [m³]. ``network`` gives the motion between the frames. volume_log_sd:
-    standard deviation of the volume's logarithm, by the cameras' view of random shapes; NaN if it is not known.
+    standard deviation of the volume's logarithm, by the cameras' view of random shapes; NaN if it is not known. mirror:
+    plane of symmetry at frame 0 that the filling used, None if it used none.
     """
 
     positions: np.ndarray
@@ -51,6 +54,7 @@ class Trajectory:
     volume: float
     network: DeformationNetwork
     volume_log_sd: float = math.nan
+    mirror: MirrorPlane | None = None
 
     def evaluate(self, times: np.ndarray) -> np.ndarray:
         """Positions (K, Q, 3) float32 [m] at any ``times`` (K,) [s] within the observed span."""
@@ -59,6 +63,7 @@ class Trajectory:
     def save(self, path: Path) -> None:
         """Write ``path`` (.npz): positions, times, spacing, volume and the network, completely or not at all."""
         weights = {f"network/{name}": value.detach().numpy() for name, value in self.network.state_dict().items()}
+        mirror = {} if self.mirror is None else {"mirror": [*self.mirror.normal, self.mirror.offset]}
         write_npz(
             path,
             positions=self.positions,
@@ -67,6 +72,7 @@ class Trajectory:
             volume=self.volume,
             volume_log_sd=self.volume_log_sd,
             network_settings=json.dumps(self.network.settings),
+            **mirror,
             **weights,
         )
 
@@ -85,7 +91,9 @@ class Trajectory:
                 network.load_state_dict(weights)
                 log_sd = float(file["volume_log_sd"]) if "volume_log_sd" in file else math.nan
                 spacing, volume = float(file["spacing"]), float(file["volume"])
-                return cls(file["positions"], file["times"], spacing, volume, network, log_sd)
+                plane = file["mirror"] if "mirror" in file else None
+                mirror = None if plane is None else MirrorPlane(plane[:3], float(plane[3]))
+                return cls(file["positions"], file["times"], spacing, volume, network, log_sd, mirror)
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
             raise InputError(f"{path} is not a trajectory saved by masiv ({error}); run masiv trajectory") from error
 
@@ -107,7 +115,8 @@ def estimate_trajectory(
     scene = with_velocities(scene, dynamic.base_positions(scene.times))
     progress("volume", 0, 1)
     prior = known_volume(scene, config)
-    start = fill_first_frame(scene, dynamic, config, prior)
+    mirror = first_mirror(scene, config, progress)
+    start = fill_first_frame(scene, dynamic, config, prior, mirror)
     hull = hull_volume(scene, config)
     # A body keeps its volume. So it is known more closely in the frames after the first: to half of that, an estimate.
     same = None if prior is None else replace(prior, volume=start.volume, log_sd=prior.log_sd / 2)
@@ -120,7 +129,7 @@ def estimate_trajectory(
     if not np.isfinite(positions).all():
         raise MasivError("trajectory: the motion became non-finite; lower trajectory.learning_rate")
     log_sd = math.nan if prior is None else prior.log_sd
-    return Trajectory(positions, scene.times, start.spacing, start.volume, network, log_sd)
+    return Trajectory(positions, scene.times, start.spacing, start.volume, network, log_sd, mirror)
 
 
 def known_volume(scene: Scene, config: TrajectoryConfig) -> VolumePrior | None:
@@ -132,16 +141,49 @@ def known_volume(scene: Scene, config: TrajectoryConfig) -> VolumePrior | None:
     return volume_prior(scene, {k: visual_hull(scene, k, resolution=config.fill_resolution) for k in sorted(chosen)})
 
 
+def first_mirror(scene: Scene, config: TrajectoryConfig, progress: Progress = silent) -> MirrorPlane | None:
+    """The mirror plane of the object at frame 0 that ``config.symmetry`` asks for; None if there is none.
+
+    Raises InputError if the silhouettes contradict a plane that is given, or there are none. A plane that was searched
+    for is dropped then.
+    """
+    given = config.symmetry if isinstance(config.symmetry, tuple) else None
+    if config.symmetry == "none":
+        return None
+    if scene.load_cloud is not None:
+        if given is None:
+            return None
+        raise InputError(f"trajectory.symmetry: {scene.path} has point clouds, which no hull surrounds: set it to none")
+    hull = visual_hull(scene, 0, resolution=config.fill_resolution)
+    progress("symmetry", 0, 1)
+    plane = mirror_plane(hull, None if given is None else np.array(given))
+    tighter = symmetric_hull(hull, plane)
+    against = contradicting(silhouettes(scene, 0), hull, tighter)
+    if against and given is not None:
+        raise InputError(
+            f"trajectory.symmetry: the masks of view {against[0]} at frame 0 contradict a mirror plane with the normal "
+            f"{list(given)}: give another one, auto or none"
+        )
+    ratio = tighter.volume / hull.volume
+    progress("symmetry", 1, 1, "no mirror plane" if against else f"{plane}, {ratio:.2f} of the hull's volume")
+    return None if against else plane
+
+
 def fill_first_frame(
-    scene: Scene, dynamic: DynamicGaussians, config: TrajectoryConfig, prior: VolumePrior | None = None
+    scene: Scene,
+    dynamic: DynamicGaussians,
+    config: TrajectoryConfig,
+    prior: VolumePrior | None = None,
+    mirror: MirrorPlane | None = None,
 ) -> FilledVolume:
     """The canonical continuum: frame 0 filled, without the points whose motion leaves the masks of later frames.
 
     Carving over time uses the silhouettes of all frames. Corners of the hull that no camera can exclude at frame 0 are
     outside of a silhouette as soon as the object has turned or touched the ground. prior: of the object's volume. Masks
     and motion have errors, so it takes more images to remove a point if less than a probable volume would be left.
+    mirror: plane of symmetry of the object at frame 0.
     """
-    field = density_field(scene, dynamic, 0, config, prior=prior)
+    field = density_field(scene, dynamic, 0, config, prior=prior, mirror=mirror)
     solid = np.argwhere(field.density > 0.5)
     voxels = field.lower + field.spacing * solid
     against = images_against(scene, dynamic.deformation, voxels, config)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from masiv.scene.frame_cache import Frame
 from masiv.scene.scene import Scene
 from masiv.scene.summary import conventions
 from masiv.tracks.tracks import Tracks
@@ -73,7 +74,7 @@ def _scene_identity(scene: Scene) -> dict[str, Any]:
         ends = [scene.cloud(frame) for frame in (0, scene.frame_count - 1)]
         return {**conventions(scene), "clouds_sha256": content_hash(ends, DIGITS)[:16]}
     for view, frame in ((visible[0], 0), (visible[-1], scene.frame_count - 1)):
-        picture = scene.frame(view, frame)
+        picture = _picture(scene, view, frame)
         pictures.update(picture.image.tobytes())
         if not scene.masks_estimated:  # those follow from the pictures and from this version of masiv
             pictures.update(picture.mask.tobytes())
@@ -84,6 +85,14 @@ def _scene_identity(scene: Scene) -> dict[str, Any]:
         "cameras_sha256": cameras.hexdigest()[:16],
         "pictures_sha256": pictures.hexdigest()[:16],
     }
+
+
+def _picture(scene: Scene, view: int, frame: int) -> Frame:
+    """A picture; without its mask if that would have to be estimated, which takes seconds."""
+    if scene.load_with_mask is None:
+        return scene.frame(view, frame)
+    camera = scene.cameras[view]
+    return scene.load_with_mask(view, frame, np.zeros((camera.height, camera.width), np.float32))
 
 
 def _tracks_identity(tracks: Tracks) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from masiv import runtime
 from masiv.config import Config
 from masiv.errors import InputError
+from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
 from masiv.progress import Progress, silent
 from masiv.report.history import logged
@@ -126,7 +127,8 @@ def ensure_twin(run: RunFolder, config: Config, scene: Scene, progress: Progress
 def other_recordings(config: Config) -> list[tuple[Scene, Trajectory]]:
     """The other recordings of the same object that a law is learnt from, without their held-out frames and cameras."""
     runs = [RunFolder.open(Path(path)) for path in config.identify.also]
-    return [(training_scene(run, read_scene(run.scene_path)), load_trajectory(run)) for run in runs]
+    scenes = [with_kept_masks(read_scene(run.scene_path), run.masks) for run in runs]
+    return [(training_scene(run, scene), load_trajectory(run)) for run, scene in zip(runs, scenes, strict=True)]
 
 
 def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> Trajectory | None:

@@ -11,6 +11,7 @@ from masiv.config import Config
 from masiv.errors import InputError
 from masiv.files import write_json
 from masiv.observations.identity import identity
+from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
 from masiv.pipeline import stages
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
@@ -52,7 +53,8 @@ class VideoRun(Run):
         cameras = tuple(sorted(set(request.holdout_camera))) or (existing.holdout_cameras if existing else ())
         read.restricted(fit_frames, cameras)
         asked = Request(config.model_dump(mode="json"), scene, identity(read), fit_frames, cameras)
-        return cls(RunFolder.create_or_resume(out, asked), config, read)
+        folder = RunFolder.create_or_resume(out, asked)
+        return cls(folder, config, with_kept_masks(read, folder.masks))
 
     def reconstruct(self, progress: Progress = silent) -> Summary:
         dynamic = stages.ensure_gaussians(self.folder, self.config, self.scene, progress)
@@ -85,8 +87,12 @@ class VideoRun(Run):
         }
         text = f"{self.folder.trajectory}: {particles} particles, {frames} frames, {made.spacing * 1e3:.1f} mm apart"
         data["volume_log_sd"] = made.volume_log_sd if math.isfinite(made.volume_log_sd) else None
+        plane = ""
+        if made.mirror is not None:
+            data["mirror_plane"] = {"normal": made.mirror.normal.tolist(), "offset_m": made.mirror.offset}
+            plane = f", {made.mirror}"
         error = "" if math.isnan(made.volume_log_sd) else f" ± {made.volume * made.volume_log_sd * 1e3:.2f}"
-        return Summary(data, f"{text}, {made.volume * 1e3:.2f}{error} litres")
+        return Summary(data, f"{text}, {made.volume * 1e3:.2f}{error} litres{plane}")
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()

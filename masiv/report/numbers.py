@@ -78,6 +78,7 @@ def run_numbers(
             "spacing_m": float(trajectory.spacing),
             "volume_m3": float(trajectory.volume),
             **_volume_error(trajectory),
+            **_mirror_plane(trajectory),
         },
         "seconds": run.seconds(),
     }
@@ -86,6 +87,13 @@ def run_numbers(
 def _volume_error(trajectory: Trajectory) -> dict[str, float]:
     error = float(trajectory.volume * trajectory.volume_log_sd)
     return {"volume_standard_error_m3": error} if np.isfinite(error) else {}
+
+
+def _mirror_plane(trajectory: Trajectory) -> dict[str, Any]:
+    mirror = trajectory.mirror
+    if mirror is None:
+        return {}
+    return {"mirror_plane": {"normal": mirror.normal.tolist(), "offset_m": float(mirror.offset)}}
 
 
 def material_numbers(run: RunFolder) -> dict[str, Any]:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from masiv.errors import InputError
 from masiv.scene.declaration import SceneDeclaration
-from masiv.scene.pictures import Pictures, crop_mask
+from masiv.scene.pictures import ESTIMATED, Pictures, crop_mask
 from masiv.scene.scene import Scene
+from masiv.scene.segmenter import VideoSegmenter
 
 MAX_LISTED = 8
 
@@ -56,7 +59,12 @@ def assemble(
         pictures = replace(pictures, depth_unit=declaration.depth_unit)
     if declaration.depth_noise is not None:
         pictures = replace(pictures, depth_noise=declaration.depth_noise.noise())
+    if declaration.masks is not None:
+        beside = folder.parent if folder.is_file() else folder
+        weights = beside / Path(declaration.masks.weights).expanduser()
+        pictures = pictures.with_segmenter(VideoSegmenter(weights), declaration.masks.boxes_by_view(cameras))
     source, more = pictures.mask_sources()
+    estimated = any(mask.kind in ESTIMATED for mask in pictures.masks.values())
     return Scene(
         path=folder,
         layout=layout,
@@ -69,13 +77,19 @@ def assemble(
         density=declaration.density or conventions.density,
         load=pictures.load,
         mask_source=source,
-        masks_estimated=any(mask.kind in ("background", "plain") for mask in pictures.masks.values()),
+        masks_estimated=estimated,
+        load_with_mask=pictures.load if estimated else None,
+        mask_inputs=partial(_mask_inputs, pictures, declaration) if estimated else None,
         background=pictures.background,
         problems=(*problems, *guesses(declaration, conventions), *gaps, *more, *pictures.depth_problems()),
         fit_frames=declaration.fit_frames,
         depth_noise=pictures.depth_noise if pictures.depths else None,
         missing=frozenset((v, k) for v in range(len(cameras)) for k in range(frame_count)) - pictures.paths.keys(),
     )
+
+
+def _mask_inputs(pictures: Pictures, declaration: SceneDeclaration) -> list[Any]:
+    return [declaration.model_dump(mode="json"), *pictures.mask_inputs()]
 
 
 def guesses(declaration: SceneDeclaration, conventions: Conventions) -> list[str]:

@@ -17,6 +17,7 @@ from masiv.scene.shutter import Shutter
 from masiv.strict import read_yaml, validated
 
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Box = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -41,6 +42,33 @@ class DepthNoiseDeclaration(BaseModel):
         return DepthNoise(self.constant, self.quadratic)
 
 
+class MasksDeclaration(BaseModel):
+    """Masks by a video segmenter, for pictures that have none; see ``masiv.scene.segmenter``.
+
+    weights: the folder of the model, relative to scene.yaml. boxes: around the object in the first picture of a camera,
+    (x0, y0, x1, y1) [pixels]; needed for cameras without a picture of the empty scene.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    segmenter: Literal["sam2"]
+    weights: Annotated[str, Field(min_length=1)]
+    boxes: dict[str, Box] = Field(default_factory=dict)
+
+    def boxes_by_view(self, cameras: Sequence[Camera]) -> dict[int, Box]:
+        """``boxes`` by index of the camera. Raises InputError for an unknown camera and a box outside its picture."""
+        views = {camera.name: view for view, camera in enumerate(cameras)}
+        for name, (x0, y0, x1, y1) in self.boxes.items():
+            if name not in views:
+                raise InputError(f"scene.yaml: masks.boxes names camera {name!r}, the cameras are {', '.join(views)}")
+            camera = cameras[views[name]]
+            if not (0 <= x0 < x1 <= camera.width and 0 <= y0 < y1 <= camera.height):
+                raise InputError(
+                    f"scene.yaml: masks.boxes.{name} must be [x0, y0, x1, y1] with x0 < x1 and y0 < y1 in the picture "
+                    f"of {camera.width}×{camera.height} pixels"
+                )
+        return {views[name]: box for name, box in self.boxes.items()}
+
+
 class SceneDeclaration(BaseModel):
     """Keys of ``scene.yaml``. A missing key has the default of the layout.
 
@@ -49,7 +77,8 @@ class SceneDeclaration(BaseModel):
     masks are cut to it. fit_frames: number of training frames, unless --fit-frames is given. exposure_time [s]: of a
     row. readout_time [s]: of a rolling shutter, from the top row to the last one; negative if the last row is read
     first. Both are one number, or a mapping from names of cameras; those that are not in it have 0. depth_unit [m]: of
-    the steps of depth pictures. depth_noise: standard deviation of a depth z, constant [m] + quadratic [1/m] z².
+    the steps of depth pictures. depth_noise: standard deviation of a depth z, constant [m] + quadratic [1/m] z². masks:
+    a video segmenter for pictures without masks.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -64,6 +93,7 @@ class SceneDeclaration(BaseModel):
     readout_time: FiniteFloat | dict[str, FiniteFloat] = 0.0
     depth_unit: Annotated[FiniteFloat, Field(gt=0)] | None = None
     depth_noise: DepthNoiseDeclaration | None = None
+    masks: MasksDeclaration | None = None
 
     @field_validator("up_axis", mode="before")
     @classmethod

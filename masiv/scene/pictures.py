@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -18,10 +18,13 @@ from masiv.scene.camera import Camera
 from masiv.scene.depth import MILLIMETRE, DepthNoise, depth_size, read_depth
 from masiv.scene.lens import Lens
 from masiv.scene.scene import Frame
+from masiv.scene.segmenter import Prompt, Segmentation, VideoSegmenter
 
 OCCLUDER_ALPHA = 50
 MAX_LEARNT, MAX_LEARNT_A_VIEW = 48, 6
 """Pictures from which the noise and the light of a recording are learnt, in all and of one view."""
+ESTIMATED = ("background", "plain", "segmenter")
+"""Kinds of masks that are estimated from colours."""
 Key = tuple[int, int]  # camera index, frame
 
 
@@ -31,10 +34,10 @@ class MaskSource:
 
     alpha: the fourth channel of ``path``, or of the picture itself. mask: ``path`` is white on the object. cutout:
     ``path`` has all but the object painted white. background: difference from the view's empty background. plain:
-    difference from the border's colour. depth: what is nearer than the view's empty scene.
+    difference from the border's colour. depth: what is nearer than the view's empty scene. segmenter: SAM 2.
     """
 
-    kind: Literal["alpha", "mask", "cutout", "background", "plain", "depth"]
+    kind: Literal["alpha", "mask", "cutout", "background", "plain", "depth", "segmenter"]
     description: str
     path: Path | None = None
 
@@ -51,7 +54,8 @@ class Pictures:
     By camera: ``lenses`` to undistort; ``backgrounds``, pictures of the empty scene; ``occluders``, pictures with
     positive alpha on what hides the scene; ``crops`` (H, W) bool, False outside of the declared crop box.
     ``depths``: depth pictures in steps of ``depth_unit`` [m], with ``depth_noise``; ``empty_depths``, by camera, of the
-    empty scene.
+    empty scene. ``segmenter``: makes the masks of that kind; ``boxes`` (x0, y0, x1, y1) [pixels], by camera, are around
+    the object in its first picture.
     """
 
     paths: dict[Key, Path]
@@ -65,10 +69,38 @@ class Pictures:
     empty_depths: dict[int, Path] = field(default_factory=dict)
     depth_unit: float = MILLIMETRE
     depth_noise: DepthNoise = field(default_factory=DepthNoise)
+    segmenter: VideoSegmenter | None = None
+    boxes: dict[int, tuple[float, float, float, float]] = field(default_factory=dict)
 
-    def load(self, view: int, frame: int) -> Frame:
+    def with_segmenter(
+        self, segmenter: VideoSegmenter, boxes: dict[int, tuple[float, float, float, float]]
+    ) -> Pictures:
+        """With masks by ``segmenter`` in place of those that would be estimated from colours.
+
+        Raises InputError if there are none, if the segmenter is not there, or if nothing marks the object in a view.
+        """
+        chosen = {key for key, source in self.masks.items() if source.kind in ESTIMATED}
+        if not chosen:
+            raise InputError(
+                f"scene.yaml: masks.segmenter has nothing to do, the masks are given ({self.mask_sources()[0]}): "
+                "remove the key masks, or the given masks"
+            )
+        segmenter.check()
+        unmarked = {view for view, _ in chosen} - boxes.keys() - self.backgrounds.keys()
+        if unmarked:
+            names = ", ".join(self.cameras[view].name for view in sorted(unmarked))
+            raise InputError(
+                f"scene.yaml: masks.boxes lacks {names}, of which there is no picture without the object: "
+                "give the box [x0, y0, x1, y1] around the object in the first picture, in pixels"
+            )
+        source = MaskSource("segmenter", f"SAM 2 ({segmenter.weights.name})")
+        masks = {key: source if key in chosen else known for key, known in self.masks.items()}
+        return replace(self, masks=masks, segmenter=segmenter, boxes=boxes)
+
+    def load(self, view: int, frame: int, mask: np.ndarray | None = None) -> Frame:
         """The picture of ``view`` at ``frame``. One that does not exist is black, and not valid anywhere.
 
+        mask (H, W) float32: of this picture, if it is known.
         Raises InputError if a file cannot be read or its size differs from that of its view.
         """
         camera = self.cameras[view]
@@ -81,7 +113,10 @@ class Pictures:
                 f"{path} has no alpha channel, unlike other pictures of {camera.name}: its mask is unknown"
             )
         depth = self._depth(view, self.depths.get((view, frame))) if self.depths else None
-        mask = self._mask(view, self.masks[view, frame], image, depth)
+        if mask is None:
+            mask = self._mask(view, frame, image, depth)
+            if self.crops is not None:
+                mask = mask * self.crops[view]
         valid = np.ones(image.shape[:2], bool)
         if view in self.lenses:
             valid &= self.lenses[view].visible
@@ -89,8 +124,6 @@ class Pictures:
             occluder = self._read(view, self.occluders[view])
             if occluder.shape[-1] == 4:
                 valid &= occluder[..., 3] <= OCCLUDER_ALPHA
-        if self.crops is not None:
-            mask = mask * self.crops[view]
         if depth is not None:
             depth = np.where(valid, depth, np.float32(0))
         return Frame(image[..., :3], mask, valid, depth)
@@ -98,6 +131,18 @@ class Pictures:
     def background(self, view: int) -> np.ndarray | None:
         """The empty scene in ``view``, (H, W, 3) uint8, or None if there is no picture of it."""
         return self._read(view, self.backgrounds[view])[..., :3] if view in self.backgrounds else None
+
+    def mask_inputs(self) -> list[Any]:
+        """What the masks depend on, besides code: files by name, size and time of their last change, and lenses."""
+        named = [("picture", *key, path) for key, path in self.paths.items()]
+        named += [(mask.kind, *key, mask.path) for key, mask in self.masks.items()]
+        named += [("depth", *key, path) for key, path in self.depths.items()]
+        for kind in ("backgrounds", "occluders", "empty_depths"):
+            named += [(kind, view, -1, path) for view, path in getattr(self, kind).items()]
+        if self.segmenter is not None:
+            named += [("weights", -1, -1, path) for path in self.segmenter.files()]
+        files = [[kind, view, frame, *_file_state(path)] for kind, view, frame, path in named]
+        return [files, self.cameras, self.lenses]
 
     def mask_sources(self) -> tuple[str, list[str]]:
         """The description of the main source of the masks, and a problem for each other source."""
@@ -137,7 +182,8 @@ class Pictures:
         depth = read_depth(path, self.depth_unit)
         return self.lenses[view].undistort_nearest(depth) if view in self.lenses else depth
 
-    def _mask(self, view: int, source: MaskSource, image: np.ndarray, depth: np.ndarray | None) -> np.ndarray:
+    def _mask(self, view: int, frame: int, image: np.ndarray, depth: np.ndarray | None) -> np.ndarray:
+        source = self.masks[view, frame]
         other = None if source.path is None else self._read(view, source.path)
         colour = np.ascontiguousarray(image[..., :3])
         if source.kind == "alpha":
@@ -149,17 +195,46 @@ class Pictures:
             return masks.from_white(other[..., :3], colour)
         if source.kind == "background":
             return self._background_model.mask(view, colour)
+        if source.kind == "segmenter":
+            return self._segmentation.mask(view, frame)
         if source.kind == "depth" and depth is not None:
             return depth_masks.from_empty_depth(depth, self._depth(view, self.empty_depths[view]), self.depth_noise)
         return masks.from_plain_background(colour)
 
     @cached_property
-    def _background_model(self) -> BackgroundModel:
-        """Learnt from some pictures of each view whose mask is the difference from the empty scene."""
+    def _segmentation(self) -> Segmentation:
+        assert self.segmenter is not None
+        return Segmentation(self.segmenter, self._frames_of("segmenter"), self._image, self._prompt)
+
+    def _prompt(self, view: int) -> Prompt:
+        """The declared box, or box and points of the difference from the empty scene."""
+        if view in self.boxes:
+            return Prompt(self.boxes[view], np.empty((0, 2)))
+        first = self._frames_of("segmenter")[view][0]
+        found = Prompt.of_mask(self._background_model.mask(view, self._image(view, first)))
+        if found is None:
+            raise InputError(
+                f"{self.paths[view, first]} does not differ from the picture without the object: replace one of them, "
+                f"or give the box around the object in scene.yaml, masks.boxes.{self.cameras[view].name}"
+            )
+        return found
+
+    def _image(self, view: int, frame: int) -> np.ndarray:
+        return np.ascontiguousarray(self._read(view, self.paths[view, frame])[..., :3])
+
+    def _frames_of(self, *kinds: str) -> dict[int, list[int]]:
+        """Frames whose mask is of one of these ``kinds``, ascending, by view."""
         frames: dict[int, list[int]] = {}
         for (view, frame), source in sorted(self.masks.items(), key=lambda item: item[0]):
-            if source.kind == "background":
+            if source.kind in kinds:
                 frames.setdefault(view, []).append(frame)
+        return frames
+
+    @cached_property
+    def _background_model(self) -> BackgroundModel:
+        """Learnt from some pictures of each view whose mask, or its prompt, is the difference from the empty scene."""
+        found = self._frames_of("background", "segmenter")
+        frames = {view: known for view, known in found.items() if view in self.backgrounds and view not in self.boxes}
         count = min(MAX_LEARNT_A_VIEW, max(2, MAX_LEARNT // len(frames)))
         chosen = {
             view: [known[i] for i in np.unique(np.linspace(0, len(known) - 1, count).round().astype(int))]
@@ -180,6 +255,13 @@ class Pictures:
                 f"{path} is {width}×{height}, the other pictures of its view are {camera.width}×{camera.height}"
             )
         return self.lenses[view].undistort(pixels) if view in self.lenses else pixels
+
+
+def _file_state(path: Path | None) -> list[str | int]:
+    if path is None:
+        return []
+    stat = path.stat()
+    return [path.resolve().as_posix(), stat.st_size, stat.st_mtime_ns]
 
 
 def read_pixels(path: Path) -> np.ndarray:

@@ -39,9 +39,9 @@ def read(folder: Path) -> Scene:
     files = _files(folder)
     if declaration.fps is None:
         raise InputError(f"{folder / 'scene.yaml'} must give fps: point clouds have no times")
-    for key in ("depth_unit", "depth_noise"):
+    for key, of in (("depth_unit", "depth pictures"), ("depth_noise", "depth pictures"), ("masks", "pictures")):
         if getattr(declaration, key) is not None:
-            raise InputError(f"{folder / 'scene.yaml'}: {key} is for depth pictures, {folder} has point clouds")
+            raise InputError(f"{folder / 'scene.yaml'}: {key} is for {of}, {folder} has point clouds: remove it")
     if declaration.fit_frames is not None and declaration.fit_frames > len(files):
         raise InputError(f"scene.yaml: fit_frames is {declaration.fit_frames}, the scene has {len(files)} frames")
     up = declaration.up(CONVENTIONS.up)

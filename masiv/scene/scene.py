@@ -16,6 +16,9 @@ from masiv.scene.cloud import Cloud
 from masiv.scene.depth import DepthNoise
 from masiv.scene.frame_cache import Frame, FrameCache
 
+MaskedReader = Callable[[int, int, np.ndarray], Frame]
+"""(view, frame, mask (H, W) float32) -> the picture with this mask."""
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -60,7 +63,9 @@ class Scene:
     masks_estimated: bool = False
     background: Callable[[int], np.ndarray | None] = _unknown_background
     problems: tuple[str, ...] = ()
-    correct_masks: Callable[[Scene, int], Mapping[int, Frame]] | None = None
+    correct_masks: CorrectMasks | None = None
+    load_with_mask: MaskedReader | None = None
+    mask_inputs: Callable[[], Any] | None = None
     hidden_views: tuple[int, ...] = ()
     fit_frames: int | None = None
     depth_noise: DepthNoise | None = None
@@ -153,3 +158,7 @@ class Scene:
         if self.cameras and len(hidden) >= len(self.cameras):
             raise InputError("--holdout-camera leaves no camera to train on")
         return replace(self, frame_count=count, hidden_views=hidden)
+
+
+CorrectMasks = Callable[[Scene, int], Mapping[int, Frame]]
+"""(scene, frame) -> the pictures of the frame by view, with masks that agree with each other."""
