@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from test_reconstruct import CONFIG, filmed, truth
 from textured_ball import FPS, FRAMES, ball, camera_at
 
+from masiv.calibration.gauge import displacement_jacobian
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.pipeline import stages
@@ -18,7 +19,7 @@ from masiv.runfolder import Request, RunFolder
 from masiv.scene.calibration import NO_CORRECTION, Calibration, CameraCorrection, corrected_camera
 from masiv.scene.shutter import Shutter
 from masiv.splat.config import CalibrationConfig
-from masiv.splat.image_formation import ImageFormation, displacement_jacobian, rotate
+from masiv.splat.image_formation import ImageFormation, rotate
 from masiv.splat.objective import Objective, Part
 from masiv.splat.observed_image import ObservedImage
 from masiv.splat.reconstruct import reconstruct
