@@ -1,7 +1,9 @@
 """Cameras corrected by their silhouettes alone, before anything is reconstructed.
 
-Bundle adjustment of the epipolar tangency residuals of all pairs of cameras (``frontier``) with the prior of the
-corrections and without the gauge (``gauge``): Gauss-Newton steps with the weights of Student's distribution.
+Bundle adjustment of the epipolar tangency residuals of all pairs of cameras (``frontier``), with the prior of the
+corrections and without their gauge (``gauge``). The residuals have Student's distribution; its scale, its degrees of
+freedom and the correlation between frames are estimated from them (EM, Lange, Little and Taylor, "Robust statistical
+modeling using the t distribution", JASA 84, 1989).
 """
 
 from __future__ import annotations
@@ -10,125 +12,227 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.stats import t as student
 
 from masiv.calibration.config import CalibrationPrior
-from masiv.calibration.consistency import pair_errors, consistency
-from masiv.calibration.frontier import Outlines, TangencyResiduals, tangency_residuals, world_rays
+from masiv.calibration.consistency import consistency, pair_errors
+from masiv.calibration.frontier import Outlines, TangencyResiduals, tangency_residuals
 from masiv.calibration.gauge import (
     POSE,
+    at_camera,
     camera_precision,
     displacement_jacobian,
     gauge_free_steps,
     prior_deviations,
     scaled_deviations,
 )
-from masiv.calibration.tangency import outline
+from masiv.calibration.outline_points import OutlinePoints, outline_points
+from masiv.calibration.tangency import Outline, outline
+from masiv.scene.calibration import CameraCorrection
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 
-NU = 4.0
-STEPS = 40
 MAX_FRAMES = 48
-MIN_NOISE_PX = 0.02
-CORR = True
+"""Of a long recording, pairs of successive frames are taken, evenly spaced: the motion of outlines needs both."""
+MAX_STEPS = 30
+CONVERGED_PX = 0.01
+"""Steps end when none moves the object by more in any picture; a tangent that jumps between two vertices of an outline
+moves it by about as much."""
+FINEST_NOISE_PX = 0.01
+"""No outline is known better: masks have at most 256 levels, and a pixel of an edge may be curved."""
+FEWEST_DEGREES, MOST_DEGREES = 1.0, 30.0
+"""Of freedom: from Cauchy's distribution to one that is normal for every purpose here."""
+
 
 @dataclass(frozen=True)
-class ObjectPoints:
+class SilhouetteFit:
+    """Corrections of V cameras, in the order of ``Scene.views``.
+
+    corrections: about ``pivot`` (3,) [m]; at_camera (V, 8): the same, with the translation of the camera's own centre,
+    which the prior is about. points: of the object. standard_errors_px (V,): of the corrections that are left without
+    the gauge, as RMS displacement of the object. inconsistency (V,) [pixels]: of the given cameras,
+    ``Consistency.pixels``. noise_px: scale of the outlines' errors.
+    """
+
+    corrections: tuple[CameraCorrection, ...]
+    at_camera: np.ndarray
     pivot: np.ndarray
     points: np.ndarray
-    velocities: np.ndarray
+    standard_errors_px: tuple[float, ...]
+    inconsistency: np.ndarray
+    noise_px: float
 
 
-def object_points(cameras, outlines, fps, per_outline=8):
-    means = np.stack([world_rays(c, h).mean(axis=1) for c, h in zip(cameras, outlines.hulls)])  # V F 3
-    means /= np.linalg.norm(means, axis=-1, keepdims=True)
-    projectors = np.eye(3) - means[..., :, None] * means[..., None, :]
-    centres_cam = np.stack([c.centre for c in cameras])
-    seen = np.isfinite(means).all(-1)
-    projectors = np.where(seen[..., None, None], projectors, 0)
-    count = seen.sum(axis=0)
-    usable = np.flatnonzero(count >= 2)
-    A = projectors[:, usable].sum(axis=0); b = np.einsum('vfij,vj->fi', projectors[:, usable], centres_cam)
-    centres = np.linalg.solve(A + 1e-9*np.eye(3), b[..., None])[..., 0]
-    frames = outlines.frames[usable]
-    vel = np.gradient(centres, frames / fps, axis=0) if len(frames) > 1 else np.zeros_like(centres)
-    pts, vs = [], []
-    for c, h in zip(cameras, outlines.hulls):
-        k = np.linspace(0, h.shape[1], per_outline, endpoint=False).astype(int)
-        rays = world_rays(c, h[usable][:, k]); rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        depth = ((centres - c.centre)[:, None] * rays).sum(-1)
-        p = c.centre + depth[..., None] * rays
-        ok = np.isfinite(p).all(-1)
-        pts.append(p[ok]); vs.append(np.broadcast_to(vel[:, None], p.shape)[ok])
-    p = np.concatenate(pts)
-    return ObjectPoints(p.mean(axis=0), p, np.concatenate(vs))
+def calibrate_from_silhouettes(scene: Scene, prior: CalibrationPrior) -> SilhouetteFit | None:
+    """The cameras of ``scene`` that are not held out; None if no two of them see a common tangent plane.
+
+    Masks are taken before they are made to agree over the views: that agreement is with the given cameras.
+    """
+    frames = _chosen_frames(scene.observed_frames)
+    cameras = [scene.cameras[view] for view in scene.views]
+    outlines = [[outline(scene.load(view, frame)) for frame in frames] for view in scene.views]
+    offsets = np.array([scene.time_offset(view) for view in scene.views])
+    return fit_silhouettes(cameras, outlines, frames, scene.fps, prior, offsets)
 
 
-@dataclass
-class Fit:
-    corrections: np.ndarray
-    pivot: np.ndarray
-    noise: float
-    rho: float
-    se: np.ndarray
-    log: list
+def fit_silhouettes(
+    cameras: Sequence[Camera],
+    outlines: Sequence[Sequence[Outline | None]],
+    frames: Sequence[int],
+    fps: float,
+    prior: CalibrationPrior,
+    time_offsets: np.ndarray,
+) -> SilhouetteFit | None:
+    """``calibrate_from_silhouettes`` of V cameras, V lists of outlines at F ascending frames and V clocks [s]."""
+    seen = Outlines.of(outlines, frames)
+    points = outline_points(cameras, seen, fps)
+    if points is None:
+        return None
+    inconsistency = consistency(tuple(range(len(cameras))), pair_errors(list(cameras), [list(o) for o in outlines]))
+    problem = _Problem(cameras, seen, fps, prior, time_offsets, points, inconsistency.pixels)
+    parameters, curvature, noise = _solve(problem)
+    if curvature is None:
+        return None
+    found = problem.corrections(parameters)
+    covariance = problem.basis @ np.linalg.solve(curvature, problem.basis.T)
+    errors = []
+    for k, jacobian in enumerate(problem.displacements):
+        block = covariance[POSE * k : POSE * (k + 1), POSE * k : POSE * (k + 1)]
+        errors.append(float(np.sqrt(np.einsum("pij,jk,pik->", jacobian, block, jacobian) / len(jacobian))))
+    return SilhouetteFit(
+        tuple(CameraCorrection(row[:3], row[3:6], float(row[6]), float(row[7])) for row in found),
+        np.stack([at_camera(c, points.pivot) @ row for c, row in zip(cameras, found, strict=True)]),
+        points.pivot,
+        points.points,
+        tuple(errors),
+        inconsistency.pixels,
+        noise,
+    )
 
 
-def fit(cameras, outlines, raw, fps, prior, time_offsets, clock=True, scaled=True, corr=True, nu=NU, maxit=STEPS):
-    o = object_points(cameras, outlines, fps)
-    dev = prior_deviations(cameras, o.pivot, fps, prior)
-    if scaled:
-        inc = consistency(tuple(range(len(cameras))), pair_errors(list(cameras), raw)).pixels
-        dev = scaled_deviations(dev, inc, cameras, o.pivot, o.points, o.velocities)
-    if not clock:
-        dev[:, 7] *= 1e-4
-    V = len(cameras)
-    L = gauge_free_steps(cameras, o.pivot, o.points, o.velocities, dev)
-    whitening = np.zeros_like(L)
-    precision = np.zeros_like(L)
-    for v, c in enumerate(cameras):
-        rows = slice(POSE*v, POSE*(v+1))
-        precision[rows, rows] = camera_precision(c, o.pivot, dev[v])
-    # orthonormal-ish basis
-    scale = np.sqrt(1/np.diag(precision))
-    U, S, _ = np.linalg.svd(L / scale[:, None])
-    B = scale[:, None] * U[:, : POSE*V - POSE]
-    P = B.T @ precision @ B
-    z = np.zeros(B.shape[1]); log = []
-    pj = np.zeros((V, len(o.points), 2, POSE))
-    for v, c in enumerate(cameras): pj[v] = displacement_jacobian(c, o.pivot, o.points, o.velocities)
-    noise, rho, df = None, 0.0, 0.0
-    for it in range(maxit):
-        x = (B @ z).reshape(V, POSE)
-        res = tangency_residuals(cameras, outlines, x, o.pivot, fps, time_offsets)
-        r = res.angles / res.lengths
-        J = np.zeros((len(r), V, POSE)); n = np.arange(len(r))
-        for s in (0, 1): J[n, res.pairs[:, s]] = res.jacobian[:, s] / res.lengths[:, None]
-        J = J.reshape(len(r), -1) @ B
-        if noise is None: noise = max(1.4826*np.median(abs(r)), MIN_NOISE_PX)
-        for _ in range(3):
-            w = (nu + 1) / (nu + (r/noise)**2)
-            noise = max(np.sqrt((w*r*r).sum() / max(len(r) - df, 1)), MIN_NOISE_PX)
-        # intraclass corr
-        q = np.sqrt(w) * r / noise
-        counts = np.bincount(res.groups)
-        sums = np.bincount(res.groups, q)
-        G = (counts > 0).sum()
-        between = (sums**2).sum() - (q**2).sum()      # sum over pairs within group
-        npairs = (counts*(counts-1.0)).sum()
-        rho = float(np.clip(between / max(npairs,1) / (q**2).mean(), 0, 1)) if corr and npairs>0 else 0.
-        eff = 1/(1+(counts[res.groups]-1)*rho)
-        W = w/noise**2*eff
-        H0 = J.T @ (W[:, None]*J)
-        g = J.T @ (W*r) + P @ z
-        H = H0 + P
-        df = np.trace(np.linalg.solve(H, H0))
-        step = -np.linalg.solve(H, g)
-        z = z + step
-        dx = (B @ step).reshape(V, POSE)
-        moved = np.sqrt(((pj @ dx[:, None, :, None])[..., 0]**2).sum(-1).mean(-1)).max()
-        log.append((it, noise, rho, df, moved, np.median(abs(r))))
-        if moved < 1e-3: break
-    C = B @ np.linalg.inv(H) @ B.T
-    se = np.array([np.sqrt(np.einsum('pij,jk,pik->p', pj[v], C[8*v:8*v+8, 8*v:8*v+8], pj[v]).mean()) for v in range(V)])
-    return Fit((B @ z).reshape(V, POSE), o.pivot, noise, rho, se, log)
+class _Problem:
+    """Residuals and prior as functions of gauge-free parameters (M,).
+
+    basis (8 V, M): from the parameters to the corrections. precision (M, M): of the prior. displacements: V Jacobians
+    (P, 2, 8) of the pixels of the object.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        outlines: Outlines,
+        fps: float,
+        prior: CalibrationPrior,
+        time_offsets: np.ndarray,
+        points: OutlinePoints,
+        inconsistency: np.ndarray,
+    ) -> None:
+        self.cameras, self.outlines, self.fps, self.time_offsets = cameras, outlines, fps, time_offsets
+        pivot, on, velocities = points.pivot, points.points, points.velocities
+        self.pivot = pivot
+        deviations = prior_deviations(cameras, pivot, fps, prior)
+        deviations = scaled_deviations(deviations, inconsistency, cameras, pivot, on, velocities)
+        steps = gauge_free_steps(cameras, pivot, on, velocities, deviations)
+        # The range of the map without the gauge, whose dimension is eight less. Radians, metres and seconds have nothing
+        # in common: each quantity is in units of its prior.
+        units = deviations.ravel()
+        vectors = np.linalg.svd(steps / units[:, None])[0]
+        self.basis = units[:, None] * vectors[:, : len(units) - POSE]
+        self.precision = np.zeros((self.basis.shape[1],) * 2)
+        for k, (camera, deviation) in enumerate(zip(cameras, deviations, strict=True)):
+            rows = self.basis[POSE * k : POSE * (k + 1)]
+            self.precision += rows.T @ camera_precision(camera, pivot, deviation) @ rows
+        self.displacements = [displacement_jacobian(camera, pivot, on, velocities) for camera in cameras]
+
+    def corrections(self, parameters: np.ndarray) -> np.ndarray:
+        """(V, 8)."""
+        return (self.basis @ parameters).reshape(-1, POSE)
+
+    def residuals(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals (N,) [pixels], their Jacobian (N, M), and ``TangencyResiduals.groups`` (N,)."""
+        found = tangency_residuals(
+            self.cameras, self.outlines, self.corrections(parameters), self.pivot, self.fps, self.time_offsets
+        )
+        return found.angles / found.pixel_angles, self._by_parameters(found), found.groups
+
+    def _by_parameters(self, found: TangencyResiduals) -> np.ndarray:
+        rows = np.arange(len(found.angles))
+        jacobian = np.zeros((len(rows), len(self.cameras), POSE))
+        for k in range(2):
+            jacobian[rows, found.pairs[:, k]] = found.jacobian[:, k] / found.pixel_angles[:, None]
+        return jacobian.reshape(len(rows), -1) @ self.basis
+
+    def largest_move(self, step: np.ndarray) -> float:
+        """RMS displacement of the object [pixels] by a change of the parameters, in the picture where it is largest."""
+        moves = zip(self.displacements, self.corrections(step), strict=True)
+        return max(float(np.sqrt(((jacobian @ row) ** 2).sum(axis=1).mean())) for jacobian, row in moves)
+
+
+def _solve(problem: _Problem) -> tuple[np.ndarray, np.ndarray | None, float]:
+    """Parameters (M,) of the largest posterior density, its curvature (M, M) and the scale of the noise [pixels].
+
+    Zero and None if there is no residual, zero if the steps do not end at a smaller loss than they began with.
+    """
+    parameters = np.zeros(problem.basis.shape[1])
+    noise, degrees, fitted, curvature, begun = float("nan"), FEWEST_DEGREES, 0.0, None, np.zeros(0)
+    for _ in range(MAX_STEPS):
+        residuals, jacobian, groups = problem.residuals(parameters)
+        if not len(residuals):
+            return parameters, None, noise
+        if curvature is None:
+            begun = residuals
+            noise = max(1.4826 * float(np.median(np.abs(residuals))), FINEST_NOISE_PX)
+        noise, degrees = _noise(residuals, noise, degrees, fitted)
+        weights = (degrees + 1) / (degrees + (residuals / noise) ** 2) / noise**2
+        weights *= _independent_share(np.sqrt(weights) * residuals, groups)
+        data = jacobian.T @ (weights[:, None] * jacobian)
+        curvature = data + problem.precision
+        step = np.linalg.solve(curvature, -jacobian.T @ (weights * residuals) - problem.precision @ parameters)
+        # As many residuals as the data determine parameters are lost to them.
+        fitted = float(np.trace(np.linalg.solve(curvature, data)))
+        parameters = parameters + step
+        if problem.largest_move(step) < CONVERGED_PX:
+            break
+    residuals = problem.residuals(parameters)[0]
+    losses = [-student.logpdf(r / noise, degrees).mean() if len(r) else np.inf for r in (residuals, begun)]
+    return parameters if losses[0] < losses[1] else 0 * parameters, curvature, noise
+
+
+def _noise(residuals: np.ndarray, noise: float, degrees: float, fitted: float) -> tuple[float, float]:
+    """Scale [pixels] and degrees of freedom of Student's distribution of ``residuals`` (N,), of which ``fitted`` are
+    lost to parameters."""
+    for _ in range(3):
+        weights = (degrees + 1) / (degrees + (residuals / noise) ** 2)
+        share = max(1 - fitted / len(residuals), 1 / len(residuals))
+        noise = max(float(np.sqrt((weights * residuals**2).mean() / share)), FINEST_NOISE_PX)
+        found = minimize_scalar(
+            lambda log, scale=noise: -student.logpdf(residuals / scale, np.exp(log)).sum(),
+            bounds=(np.log(FEWEST_DEGREES), np.log(MOST_DEGREES)),
+            method="bounded",
+            options={"xatol": 0.05},
+        )
+        degrees = float(np.exp(found.x))
+    return noise, degrees
+
+
+def _independent_share(residuals: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Share (N,) of each of the weighted ``residuals`` (N,) that is independent of the others in its group.
+
+    A mask that is wrong at a shadow is so in all frames. n residuals with the intraclass correlation c, which is
+    estimated from all groups, tell as much as n / (1 + (n - 1) c).
+    """
+    counts = np.bincount(groups)
+    squares = float((residuals**2).sum())
+    products = float((np.bincount(groups, residuals) ** 2).sum()) - squares
+    pairs = float((counts * (counts - 1)).sum())
+    correlation = np.clip(products / pairs * len(residuals) / squares, 0, 1) if pairs and squares else 0.0
+    return 1 / (1 + (counts[groups] - 1) * correlation)
+
+
+def _chosen_frames(frames: Sequence[int]) -> tuple[int, ...]:
+    """At most ``MAX_FRAMES`` of ascending ``frames``."""
+    if len(frames) <= MAX_FRAMES:
+        return tuple(frames)
+    first = np.linspace(0, len(frames) - 2, MAX_FRAMES // 2).round().astype(int)
+    return tuple(frames[k] for k in np.unique([first, first + 1]))

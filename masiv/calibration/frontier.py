@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from masiv.calibration.gauge import POSE, cross_matrix
 from masiv.calibration.tangency import Outline
@@ -46,15 +45,15 @@ class Outlines:
 class TangencyResiduals:
     """Of N tangent planes of pairs of views.
 
-    pairs (N, 2): views. angles (N,) [rad]: from the plane of the first view to that of the second. lengths (N,) [rad
-    per pixel]: standard deviation of the angle if each outline has an error of one pixel. jacobian (N, 2, 8):
+    pairs (N, 2): views. angles (N,) [rad]: from the plane of the first view to that of the second. pixel_angles (N,) [rad]:
+    standard deviation of the angle if each outline has an error of one pixel. jacobian (N, 2, 8):
     derivative of ``angles`` with respect to the corrections of the two cameras. groups (N,): the same number for the
     same side of the same pair in all frames.
     """
 
     pairs: np.ndarray
     angles: np.ndarray
-    lengths: np.ndarray
+    pixel_angles: np.ndarray
     jacobian: np.ndarray
     groups: np.ndarray
 
@@ -84,8 +83,8 @@ def tangency_residuals(
 ) -> TangencyResiduals:
     """All that are known between the given ``cameras`` (V) after ``corrections`` (V, 8) about ``pivot`` (3,) [m].
 
-    time_offsets (V,) [s]: of the given clocks. A tangent point is moved to the time of its frame with the velocity of
-    its own plane, which the neighbouring frames give.
+    time_offsets (V,) [s]: of the given clocks. A plane is turned to the time of its frame at its own rate, which the
+    neighbouring frames give; the Jacobian takes this rate as given.
     """
     views = [
         _view(camera, row, pivot, hulls, cuts)
@@ -123,7 +122,7 @@ def _view(camera: Camera, row: np.ndarray, pivot: np.ndarray, hulls: np.ndarray,
 def _pair(
     one: _View, other: _View, clocks: np.ndarray, frames: np.ndarray, fps: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """angles, lengths, jacobian and sides of the tangent planes of two views; None if there are none."""
+    """angles, pixel_angles, jacobian and sides of the tangent planes of two views; None if there are none."""
     baseline = other.camera.centre - one.camera.centre
     length = float(np.linalg.norm(baseline))
     if length < 1e-9:
@@ -218,11 +217,6 @@ def _left_jacobian(vector: np.ndarray) -> np.ndarray:
     if angle < 1e-6:
         return np.eye(3) + k / 2
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * k @ k
-
-
-def rotation_of(vector: np.ndarray) -> np.ndarray:
-    """(3, 3), of a rotation vector (3,) [rad]."""
-    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def world_rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:

@@ -54,10 +54,8 @@ def scaled_deviations(
     for row, camera, error in zip(scaled, cameras, inconsistency, strict=True):
         if not np.isfinite(error):
             continue
-        rotation = camera.world_to_camera[:3, :3]
-        at_camera = np.eye(POSE)
-        at_camera[3:6, :3] = cross_matrix(rotation @ pivot + camera.world_to_camera[:3, 3])
-        jacobian = displacement_jacobian(camera, pivot, points, velocities) @ np.linalg.inv(at_camera)
+        local = at_camera(camera, pivot)
+        jacobian = displacement_jacobian(camera, pivot, points, velocities) @ np.linalg.inv(local)
         squares = ((jacobian * row) ** 2).sum(axis=1).mean(axis=0)
         for part, largest in ((slice(0, 7), MAX_PRIOR_SCALE), (slice(7, 8), 1.0)):
             expected = np.sqrt(squares[part].sum())
@@ -98,12 +96,17 @@ def gauge_free_steps(
     return steps - gauge @ np.linalg.solve(weighted @ gauge, weighted @ steps)
 
 
+def at_camera(camera: Camera, pivot: np.ndarray) -> np.ndarray:
+    """The linear map (8, 8) of a correction about ``pivot`` to one with the translation of the camera's own centre."""
+    found = np.eye(POSE)
+    found[3:6, :3] = cross_matrix(camera.world_to_camera[:3, :3] @ pivot + camera.world_to_camera[:3, 3])
+    return found
+
+
 def camera_precision(camera: Camera, pivot: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Inverse covariance (8, 8) of a correction about ``pivot``; deviation (8,): of rotation and translation at the
-    camera's own centre, focal length and clock."""
-    at_camera = np.eye(POSE)
-    at_camera[3:6, :3] = cross_matrix(camera.world_to_camera[:3, :3] @ pivot + camera.world_to_camera[:3, 3])
-    return at_camera.T @ np.diag(deviation**-2) @ at_camera
+    """Inverse covariance (8, 8) of a correction about ``pivot``, from a row (8,) of ``prior_deviations``."""
+    local = at_camera(camera, pivot)
+    return local.T @ np.diag(deviation**-2) @ local
 
 
 def displacement_jacobian(camera: Camera, pivot: np.ndarray, points: np.ndarray, velocities: np.ndarray) -> np.ndarray:
