@@ -134,8 +134,8 @@ class _Problem:
         deviations = prior_deviations(cameras, pivot, fps, prior)
         deviations = scaled_deviations(deviations, inconsistency, cameras, pivot, on, velocities)
         steps = gauge_free_steps(cameras, pivot, on, velocities, deviations)
-        # The range of the map without the gauge, whose dimension is eight less. Radians, metres and seconds have nothing
-        # in common: each quantity is in units of its prior.
+        # The range of the map without the gauge, whose dimension is eight less. Radians, metres and seconds have
+        # nothing in common: each quantity is in units of its prior.
         units = deviations.ravel()
         vectors = np.linalg.svd(steps / units[:, None])[0]
         self.basis = units[:, None] * vectors[:, : len(units) - POSE]

@@ -45,10 +45,10 @@ class Outlines:
 class TangencyResiduals:
     """Of N tangent planes of pairs of views.
 
-    pairs (N, 2): views. angles (N,) [rad]: from the plane of the first view to that of the second. pixel_angles (N,) [rad]:
-    standard deviation of the angle if each outline has an error of one pixel. jacobian (N, 2, 8):
-    derivative of ``angles`` with respect to the corrections of the two cameras. groups (N,): the same number for the
-    same side of the same pair in all frames.
+    pairs (N, 2): views. angles (N,) [rad]: from the plane of the first view to that of the second. pixel_angles (N,)
+    [rad]: standard deviation of the angle if each outline has an error of one pixel. jacobian (N, 2, 8): derivative of
+    ``angles`` with respect to the corrections of the two cameras. groups (N,): the same number for the same side of the
+    same pair in all frames.
     """
 
     pairs: np.ndarray
@@ -101,11 +101,12 @@ def tangency_residuals(
         return TangencyResiduals(
             np.zeros((0, 2), int), np.zeros(0), np.zeros(0), np.zeros((0, 2, POSE)), np.zeros(0, int)
         )
-    return TangencyResiduals(
-        np.concatenate([np.tile(pair, (len(rows[0]), 1)) for pair, rows in found]),
-        *(np.concatenate([rows[part] for _, rows in found]) for part in range(3)),
-        np.concatenate([2 * k + rows[3] for k, (_, rows) in enumerate(found)]),
+    angles, pixel_angles, jacobian, sides = (
+        np.concatenate(part) for part in zip(*(rows for _, rows in found), strict=True)
     )
+    pairs = np.concatenate([np.tile(pair, (len(rows[0]), 1)) for pair, rows in found])
+    groups = np.repeat(2 * np.arange(len(found)), [len(rows[0]) for _, rows in found]) + sides
+    return TangencyResiduals(pairs, angles, pixel_angles, jacobian, groups)
 
 
 def _view(camera: Camera, row: np.ndarray, pivot: np.ndarray, hulls: np.ndarray, cuts: np.ndarray) -> _View:

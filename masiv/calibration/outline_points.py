@@ -29,13 +29,16 @@ class OutlinePoints:
 def outline_points(cameras: Sequence[Camera], outlines: Outlines, fps: float) -> OutlinePoints | None:
     """Of V cameras. The centre at a frame is the point nearest to the rays through the middles of the outlines; None if
     no frame has two."""
-    middles = [_unit(world_rays(c, h).mean(axis=1)) for c, h in zip(cameras, outlines.hulls, strict=True)]
-    seen = np.isfinite(middles).all(axis=-1)
+    if not outlines.hulls.size:
+        return None
+    rays = [world_rays(camera, hulls) for camera, hulls in zip(cameras, outlines.hulls, strict=True)]
+    middles = _unit(np.stack(rays).mean(axis=2))
+    seen = np.asarray(np.isfinite(middles).all(axis=-1))
     frames = np.flatnonzero(seen.sum(axis=0) >= 2)
     if not len(frames):
         return None
-    rays = np.where(seen[..., None], middles, 0)[:, frames]
-    across = seen[:, frames, None, None] * (np.eye(3) - rays[..., :, None] * rays[..., None, :])
+    along = np.where(seen[..., None], middles, 0)[:, frames]
+    across = seen[:, frames, None, None] * (np.eye(3) - along[..., :, None] * along[..., None, :])
     total = np.einsum("vfij,vj->fi", across, np.stack([camera.centre for camera in cameras]))
     centres = (np.linalg.pinv(across.sum(axis=0)) @ total[..., None])[..., 0]
     velocities = np.zeros_like(centres)
