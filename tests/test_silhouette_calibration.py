@@ -17,6 +17,7 @@ from masiv.calibration.gauge import displacement_jacobian
 from masiv.calibration.outline_points import outline_points
 from masiv.calibration.tangency import outline, tangency_errors
 from masiv.scene.calibration import corrected_camera
+from masiv.scene.shutter import Shutter
 
 FRAMES, FPS = 8, 24.0
 CAMERAS = ring(11, size=160, focal=250.0)
@@ -175,6 +176,11 @@ def test_a_clock_that_is_late_is_found(outlines):
     assert clocks[2] - np.delete(clocks, 2).mean() == pytest.approx(0.3, abs=0.1)
     assert np.abs(np.delete(clocks, 2)).max() < 0.1
     assert rms(aligned_error(after)) < 0.15
+    # All rows of this picture lie below the last one that is read: they are as late as the clock was.
+    below = Shutter(readout_time=0.6 / FPS, first_row=-2.0, last_row=-1.0)
+    known = [dataclasses.replace(c, shutter=below) if k == 2 else c for k, c in enumerate(CAMERAS)]
+    again, _, _ = fitted(known, late)
+    assert np.abs([row.time_offset * FPS for row in again.corrections]).max() < 0.03
 
 
 def test_masks_that_say_nothing_leave_cameras_where_they_are(outlines):
