@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from test_reconstruct import CONFIG, filmed, truth
 from textured_ball import FPS, FRAMES, ball, camera_at
 
+from masiv.calibration.from_silhouettes import calibrate_from_silhouettes
+from masiv.calibration.gauge import displacement_jacobian
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.pipeline import stages
@@ -18,7 +20,7 @@ from masiv.runfolder import Request, RunFolder
 from masiv.scene.calibration import NO_CORRECTION, Calibration, CameraCorrection, corrected_camera
 from masiv.scene.shutter import Shutter
 from masiv.splat.config import CalibrationConfig
-from masiv.splat.image_formation import ImageFormation, displacement_jacobian, rotate
+from masiv.splat.image_formation import ImageFormation, rotate
 from masiv.splat.objective import Objective, Part
 from masiv.splat.observed_image import ObservedImage
 from masiv.splat.reconstruct import reconstruct
@@ -342,6 +344,37 @@ def test_perturbed_cameras_are_found_again():
     after = reprojection(scene, scene.cameras, found.refined)
     assert before > 0.5
     assert after < 0.4 * before, (before, after)
+
+
+def test_a_fit_starts_from_cameras_that_agree_with_the_silhouettes_and_the_prior_is_about_the_given_ones(tmp_path):
+    """After three steps, of which none refines the cameras, the result has what the silhouettes said and no more."""
+    scene = filmed(truth)
+    rng = np.random.default_rng(5)
+    pivot = np.array([0, 0.5, 0])
+    rough = tuple(
+        corrected_camera(c, CameraCorrection(rng.normal(0, 0.01, 3), rng.normal(0, 0.01, 3), 0.0, 0.0), pivot)
+        for c in scene.cameras
+    )
+    given = dataclasses.replace(scene, cameras=rough)
+    config = CONFIG.model_copy(update={"iterations": 3, "calibration": CalibrationConfig(start_fraction=0.99)})
+    found = reconstruct(given, config, seed=4, checkpoint=Checkpoint(None), progress=silent).calibration
+    assert found.given == rough
+    assert reprojection(scene, scene.cameras, found.refined) < 0.5 * reprojection(scene, scene.cameras, rough)
+    silhouettes = calibrate_from_silhouettes(given, config.calibration)
+    expected = [corrected_camera(c, r, silhouettes.pivot) for c, r in zip(rough, silhouettes.corrections, strict=True)]
+    for camera, other in zip(found.refined, expected, strict=True):
+        np.testing.assert_allclose(camera.world_to_camera, other.world_to_camera, atol=1e-12)
+    assert found.standard_errors_px == silhouettes.standard_errors_px
+    found.save(tmp_path)
+    assert Calibration.load(tmp_path).standard_errors_px == found.standard_errors_px
+    # The penalty of no further correction is that of the first one.
+    points = object_points()
+    still = np.zeros_like(points)
+    made = ImageFormation(expected, FRAMES, FPS, config.calibration, points, still, None, silhouettes.at_camera)
+    deviations = made.prior_deviations.double().numpy()
+    penalty = 0.5 * ((silhouettes.at_camera / deviations) ** 2).sum()
+    assert penalty > 0.1
+    assert float(made().penalty().detach()) == pytest.approx(penalty, rel=1e-4)
 
 
 def test_a_calibration_that_is_kept_is_not_written(tmp_path):

@@ -17,7 +17,7 @@ from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 
 CALIBRATION = "calibration.json"
-_SCHEMA = 1
+_SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -59,19 +59,33 @@ class Calibration:
     """The cameras of a scene before and after a fit corrected them, by index of the scene.
 
     given, refined: all cameras; those that no fit saw are the same in both. time_offsets [s] of their clocks.
-    displacement_px: root mean square by which the correction moves the object in each picture.
+    displacement_px: root mean square by which the correction moves the object in each picture. standard_errors_px: of
+    the correction by silhouettes, if there was one, as such displacements; None for cameras that no fit saw.
     """
 
     given: tuple[Camera, ...]
     refined: tuple[Camera, ...]
     time_offsets: tuple[float, ...]
     displacement_px: tuple[float, ...]
+    standard_errors_px: tuple[float | None, ...] = ()
 
     @classmethod
     def of(
-        cls, scene: Scene, corrections: Sequence[CameraCorrection], pivot: np.ndarray, points: np.ndarray
+        cls,
+        scene: Scene,
+        corrections: Sequence[CameraCorrection],
+        pivot: np.ndarray,
+        points: np.ndarray,
+        *,
+        since: Calibration | None = None,
+        standard_errors_px: Sequence[float] = (),
     ) -> Calibration:
-        """corrections: of ``scene.views``, about ``pivot`` (3,) [m]. points (P, 3) [m]: of the object."""
+        """corrections: of ``scene.views``, about ``pivot`` (3,) [m]. points (P, 3) [m]: of the object.
+
+        since: an earlier correction, which ``scene`` has already; the result is of both.
+        standard_errors_px: of ``scene.views``; by default those of ``since``.
+        """
+        given = scene.cameras if since is None else since.given
         by_view = dict(zip(scene.views, corrections, strict=True))
         every = [by_view.get(view, NO_CORRECTION) for view in range(len(scene.cameras))]
         known = scene.time_offsets or (0.0,) * len(scene.cameras)
@@ -80,14 +94,15 @@ class Calibration:
             for view, camera in enumerate(scene.cameras)
         )
         moved = [
-            after.project(points)[0] - before.project(points)[0]
-            for before, after in zip(scene.cameras, refined, strict=True)
+            after.project(points)[0] - before.project(points)[0] for before, after in zip(given, refined, strict=True)
         ]
+        errors = dict(zip(scene.views, standard_errors_px, strict=True)) if standard_errors_px else {}
         return cls(
-            scene.cameras,
+            given,
             refined,
             tuple(offset + correction.time_offset for offset, correction in zip(known, every, strict=True)),
             tuple(float(np.sqrt((m**2).sum(axis=1).mean())) for m in moved),
+            since.standard_errors_px if since else tuple(errors.get(view) for view in range(len(refined))),
         )
 
     def applied_to(self, scene: Scene) -> Scene:
@@ -131,7 +146,8 @@ class Calibration:
 
     def save(self, folder: Path) -> None:
         """Write calibration.json into ``folder``."""
-        rows = zip(self.given, self.refined, self.time_offsets, self.displacement_px, strict=True)
+        errors = self.standard_errors_px or (None,) * len(self.given)
+        rows = zip(self.given, self.refined, self.time_offsets, self.displacement_px, errors, strict=True)
         write_json(Path(folder) / CALIBRATION, {"schema": _SCHEMA, "cameras": [_row(*row) for row in rows]})
 
     @classmethod
@@ -142,7 +158,7 @@ class Calibration:
             return None
         try:
             data = json.loads(path.read_text(encoding="utf-8"))
-            if data["schema"] != _SCHEMA:
+            if data["schema"] not in (1, _SCHEMA):  # 1 has no standard errors
                 raise ValueError(f"schema {data['schema']}")
             rows = data["cameras"]
             return cls(
@@ -150,6 +166,7 @@ class Calibration:
                 tuple(_camera(row, "refined") for row in rows),
                 tuple(float(row["time_offset_s"]) for row in rows),
                 tuple(float(row["displacement_px"]) for row in rows),
+                tuple(None if (e := row.get("standard_error_px")) is None else float(e) for row in rows),
             )
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path} is not a calibration saved by masiv ({error}): reconstruct anew") from error
@@ -164,7 +181,9 @@ def _same(one: Camera, other: Camera) -> bool:
     )
 
 
-def _row(given: Camera, refined: Camera, time_offset: float, displacement: float) -> dict[str, Any]:
+def _row(
+    given: Camera, refined: Camera, time_offset: float, displacement: float, standard_error: float | None
+) -> dict[str, Any]:
     turn = refined.world_to_camera[:3, :3] @ given.world_to_camera[:3, :3].T
     return {
         "name": given.name,
@@ -175,6 +194,7 @@ def _row(given: Camera, refined: Camera, time_offset: float, displacement: float
         "focal_factor": refined.intrinsics[0, 0] / given.intrinsics[0, 0],
         "time_offset_s": time_offset,
         "displacement_px": displacement,
+        "standard_error_px": standard_error,
         **{
             name: {"intrinsics": camera.intrinsics, "world_to_camera": camera.world_to_camera}
             for name, camera in (("given", given), ("refined", refined))

@@ -4,20 +4,12 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from masiv.calibration.config import CalibrationPrior
 
-class CalibrationConfig(BaseModel):
-    """Prior standard deviations of the corrections, and the optimiser's steps."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class CalibrationConfig(CalibrationPrior):
+    """Prior standard deviations of the corrections of cameras and exposures, and the optimiser's steps."""
 
-    rotation_deg: float = Field(0.3, gt=0, description="prior standard deviation of a camera's rotation [degrees]")
-    translation_fraction: float = Field(
-        0.003, gt=0, description="of a camera's place, as a fraction of its distance to the object"
-    )
-    focal_fraction: float = Field(0.005, gt=0, description="of a camera's focal length, as a fraction")
-    time_frames: float = Field(
-        0.3, gt=0, description="of a camera's clock [frames]; 0.3 is that of cameras aligned to the nearest frame"
-    )
     log_gain: float = Field(0.05, gt=0, description="of the logarithm of an image's gain, for each colour channel")
     offset: float = Field(0.01, gt=0, description="of an image's offset, as a fraction of white")
     rate_px: float = Field(0.01, gt=0, description="initial learning rate of cameras [pixels]")

@@ -12,29 +12,25 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from masiv.calibration.gauge import POSE, gauge_free_steps, prior_deviations, scaled_deviations
 from masiv.scene.calibration import CameraCorrection
 from masiv.scene.camera import Camera
 from masiv.splat.config import CalibrationConfig
 
-POSE = 8
-"""Corrections of a camera: rotation vector (3) [rad], translation (3) [m], log focal factor, time offset [s]."""
-REGISTRATION_NOISE_PX = 0.1
-"""Error to which pictures register a camera: what the gauge takes for it when it weighs pixels and prior."""
 INDEPENDENT_ERRORS = 50
 """Errors of a picture's pixels that are independent of each other. What is left after a fit are errors of the model
 (shape, shading, motion), which are alike over patches of about a seventh of the object's width, and in all frames of a
 camera. With all pixels counted as independent the prior had no weight, and cameras circled the object by a degree to
 explain shading. The number is an estimate: it was not calibrated."""
-MIN_PRIOR_SCALE, MAX_PRIOR_SCALE = 0.02, 5.0
-"""Limits of what the silhouettes' agreement does to the prior standard deviations: no camera is exact, and a camera
-that
-is far off is found by ``inspect``, not by a fit."""
 EXPOSURE_STEP = 0.02
 """Unit of the exposure's parameters: a change of 2 % of white is as visible as about a pixel of displacement."""
 
 
 class ImageFormation(torch.nn.Module):
     """Corrections of V cameras and of the exposure of their images at T frames; zero at first.
+
+    The cameras may have been corrected by their silhouettes. Pictures contain the silhouettes, so what these said is
+    where the fit begins and no prior: that is of the sum of both corrections, about the cameras as they were given.
 
     ``pose`` (V, 8) are coordinates in which a step of one moves the object by about a pixel in its picture, or by one
     prior standard deviation. From them a linear map makes rotation about the object's centre, translation, focal length
@@ -49,6 +45,7 @@ class ImageFormation(torch.nn.Module):
     translations: torch.Tensor
     pivots: torch.Tensor
     prior_deviations: torch.Tensor
+    corrected: torch.Tensor
 
     def __init__(
         self,
@@ -59,9 +56,11 @@ class ImageFormation(torch.nn.Module):
         points: np.ndarray,
         velocities: np.ndarray,
         inconsistency: np.ndarray | None = None,
+        corrected: np.ndarray | None = None,
     ) -> None:
         """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs. inconsistency (V,)
-        [pixels]: of the given silhouettes, see ``scaled_deviations``."""
+        [pixels]: of the given silhouettes, see ``scaled_deviations``. corrected (V, 8): what was added to the given
+        cameras before, ``SilhouetteFit.at_camera``; None: nothing."""
         super().__init__()
         self.fps, self.config, self.points = fps, config, points
         self.pivot = points.mean(axis=0)
@@ -73,13 +72,15 @@ class ImageFormation(torch.nn.Module):
         deviations = prior_deviations(cameras, self.pivot, fps, config)
         if inconsistency is not None:
             deviations = scaled_deviations(deviations, inconsistency, cameras, self.pivot, points, velocities)
-        linear = _gauge_free_steps(cameras, self.pivot, points, velocities, deviations)
+        linear = gauge_free_steps(cameras, self.pivot, points, velocities, deviations)
         self.register_buffer("linear", torch.tensor(linear, dtype=torch.float32), persistent=False)
         self.register_buffer("rotations", torch.tensor(poses[:, :3, :3], dtype=torch.float32), persistent=False)
         self.register_buffer("translations", torch.tensor(poses[:, :3, 3], dtype=torch.float32), persistent=False)
         pivots = poses[:, :3, :3] @ self.pivot + poses[:, :3, 3]
         self.register_buffer("pivots", torch.tensor(pivots, dtype=torch.float32), persistent=False)
         self.register_buffer("prior_deviations", torch.tensor(deviations, dtype=torch.float32), persistent=False)
+        before = np.zeros((len(cameras), POSE)) if corrected is None else corrected
+        self.register_buffer("corrected", torch.tensor(before, dtype=torch.float32), persistent=False)
         self.pose = torch.nn.Parameter(torch.zeros(len(cameras), POSE))
         self.exposure = torch.nn.Parameter(torch.zeros(len(cameras), frame_count, 4))
 
@@ -152,7 +153,9 @@ class Corrections:
         at_camera = torch.cat([rotation, shift, self.cameras[:, 6:]], dim=1)
         gains = (self.exposures[..., :3] / config.log_gain).square().sum()
         offsets = (self.exposures[..., 3] / config.offset).square().sum()
-        return 0.5 * ((at_camera / f.prior_deviations).square().sum() + f.exposure_weight * (gains + offsets))
+        return 0.5 * (
+            ((f.corrected + at_camera) / f.prior_deviations).square().sum() + f.exposure_weight * (gains + offsets)
+        )
 
 
 def rotate(vector: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
@@ -164,106 +167,3 @@ def rotate(vector: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / angle.square())
     across = torch.linalg.cross(vector.expand_as(points), points)
     return first * across + second * torch.linalg.cross(vector.expand_as(points), across)
-
-
-def prior_deviations(cameras: Sequence[Camera], pivot: np.ndarray, fps: float, config: CalibrationConfig) -> np.ndarray:
-    """Prior standard deviations (V, 8) of rotation [rad] and translation [m] at the camera's centre, log focal factor,
-    clock [s]."""
-    rows = []
-    for camera in cameras:
-        distance = float(np.linalg.norm(camera.centre - pivot))
-        rows.append(
-            [np.radians(config.rotation_deg)] * 3
-            + [config.translation_fraction * distance] * 3
-            + [config.focal_fraction, config.time_frames / fps]
-        )
-    return np.array(rows)
-
-
-def scaled_deviations(
-    deviations: np.ndarray,
-    inconsistency: np.ndarray,
-    cameras: Sequence[Camera],
-    pivot: np.ndarray,
-    points: np.ndarray,
-    velocities: np.ndarray,
-) -> np.ndarray:
-    """Prior standard deviations (V, 8) that displace the object by what its silhouettes disagree.
-
-    inconsistency (V,) [pixels]: epipolar tangency error of each camera against the others, NaN if unknown. For random
-    errors it is about the RMS displacement of the picture. Pose with focal length, and clock, are scaled apart: each of
-    them alone may be the cause. So cameras whose silhouettes agree stay where they are, also if the pictures cannot
-    tell a clock from a height.
-    """
-    scaled = deviations.copy()
-    for row, camera, error in zip(scaled, cameras, inconsistency, strict=True):
-        if not np.isfinite(error):
-            continue
-        rotation = camera.world_to_camera[:3, :3]
-        at_camera = np.eye(POSE)
-        at_camera[3:6, :3] = _cross_matrix(rotation @ pivot + camera.world_to_camera[:3, 3])
-        jacobian = displacement_jacobian(camera, pivot, points, velocities) @ np.linalg.inv(at_camera)
-        squares = ((jacobian * row) ** 2).sum(axis=1).mean(axis=0)
-        for part, largest in ((slice(0, 7), MAX_PRIOR_SCALE), (slice(7, 8), 1.0)):
-            expected = np.sqrt(squares[part].sum())
-            row[part] *= np.clip(error / max(expected, 1e-9), MIN_PRIOR_SCALE, largest)
-    return scaled
-
-
-def _gauge_free_steps(
-    cameras: Sequence[Camera], pivot: np.ndarray, points: np.ndarray, velocities: np.ndarray, deviations: np.ndarray
-) -> np.ndarray:
-    """The map (8 V, 8 V) from the parameters to the corrections of all cameras."""
-    count = POSE * len(cameras)
-    steps, metric, gauge = np.zeros((count, count)), np.zeros((count, count)), np.zeros((count, POSE))
-    for view, (camera, deviation) in enumerate(zip(cameras, deviations, strict=True)):
-        rows = slice(POSE * view, POSE * (view + 1))
-        rotation = camera.world_to_camera[:3, :3]
-        centre = rotation @ pivot + camera.world_to_camera[:3, 3]
-        at_camera = np.eye(POSE)
-        at_camera[3:6, :3] = _cross_matrix(centre)
-        precision = at_camera.T @ np.diag(deviation**-2) @ at_camera
-        jacobian = displacement_jacobian(camera, pivot, points, velocities)
-        curvature = np.einsum("pij,pik->jk", jacobian, jacobian) / len(points)
-        # A step of one is a pixel, or one prior standard deviation where that moves the picture by less. The scale of
-        # each quantity is taken out first: radians, metres and seconds have nothing in common.
-        scaled = deviation[:, None] * (curvature + precision) * deviation
-        values, vectors = np.linalg.eigh(scaled)
-        steps[rows, rows] = deviation[:, None] * (vectors / np.sqrt(values)) @ vectors.T
-        block = curvature + REGISTRATION_NOISE_PX**2 * precision
-        # A common delay is that of the clocks' mean, whatever the cameras do.
-        block[7, :7] = block[:7, 7] = 0
-        block[7, 7] = 1
-        metric[rows, rows] = block
-        gauge[rows, :3] = np.vstack([rotation, np.zeros((5, 3))])
-        gauge[rows, 3:6] = np.vstack([np.zeros((3, 3)), rotation, np.zeros((2, 3))])
-        gauge[rows, 6] = [0, 0, 0, *centre, 0, 0]
-        gauge[rows, 7] = [0, 0, 0, 0, 0, 0, 0, 1]
-    weighted = gauge.T @ metric
-    scale = np.sqrt(np.diag(weighted @ gauge))
-    weighted, gauge = weighted / scale[:, None], gauge / scale
-    return steps - gauge @ np.linalg.solve(weighted @ gauge, weighted @ steps)
-
-
-def displacement_jacobian(camera: Camera, pivot: np.ndarray, points: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-    """Derivative (P, 2, 8) of the pixels of ``points`` (P, 3) [m] with respect to the corrections at zero."""
-    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-    x = points @ rotation.T + translation
-    k, depth = camera.intrinsics[:2, :2], x[:, 2]
-    perspective = np.zeros((len(points), 2, 3))
-    perspective[:, 0, 0] = perspective[:, 1, 1] = 1 / depth
-    perspective[:, :, 2] = -x[:, :2] / depth[:, None] ** 2
-    projection = k @ perspective
-    relative = x - (rotation @ pivot + translation)
-    out = np.empty((len(points), 2, POSE))
-    for axis in range(3):
-        out[:, :, axis] = np.einsum("pij,pj->pi", projection, np.cross(np.eye(3)[axis], relative))
-    out[:, :, 3:6] = projection
-    out[:, :, 6] = (x[:, :2] / depth[:, None]) @ k.T
-    out[:, :, 7] = np.einsum("pij,pj->pi", projection, velocities @ rotation.T)
-    return out
-
-
-def _cross_matrix(vector: np.ndarray) -> np.ndarray:
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0.0]])

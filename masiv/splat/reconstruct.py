@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from masiv import runtime
-from masiv.calibration.consistency import silhouette_consistency
+from masiv.calibration.from_silhouettes import calibrate_from_silhouettes
 from masiv.checkpoint import Checkpoint
 from masiv.errors import MasivError
 from masiv.progress import Progress
@@ -74,11 +74,15 @@ class _Fit:
     ) -> None:
         self.config = config if scene.load_cloud is None else for_clouds(config)
         self.seed, self.scene, self.worker = seed, scene, worker
+        self.silhouettes, self.by_silhouettes = None, None
         self.identity = repr(
             (config.model_dump(exclude={"processes"}), seed, str(scene.path), scene.frame_count, scene.views)
         )
         shutters = [scene.cameras[view].shutter for view in scene.views]
         self.identity += "" if all(s.is_instant for s in shutters) else repr(shutters)
+        if self.config.refine_calibration:
+            progress("reconstruct", 0, config.iterations, "cameras from silhouettes")
+            self._correct_cameras()
         initial = self._observe(progress)
         self.half_extent = initial.half_extent
         self.formation = self._image_formation(initial) if self.config.refine_calibration else None
@@ -88,6 +92,20 @@ class _Fit:
             self._begin(initial)
         if worker is not None:
             worker.configure(self.objective, self.networks, len(self.parameters["means"]))
+
+    def _correct_cameras(self) -> None:
+        """Hulls, images and the refinement of cameras start from cameras that agree with the silhouettes."""
+        found = calibrate_from_silhouettes(self.scene, self.config.calibration)
+        if found is not None:
+            self.silhouettes = found
+            self.by_silhouettes = Calibration.of(
+                self.scene,
+                found.corrections,
+                found.pivot,
+                found.points,
+                standard_errors_px=found.standard_errors_px,
+            )
+            self.scene = self.by_silhouettes.applied_to(self.scene)
 
     def _observe(self, progress: Progress) -> InitialGaussians:
         """Set the objective, ``images`` by frame and their number; returns the start of the fit."""
@@ -183,7 +201,8 @@ class _Fit:
             self.config.calibration,
             np.concatenate(surfaces),
             np.repeat(velocities, [len(points) for points in surfaces], axis=0),
-            silhouette_consistency(scene).pixels,
+            None if self.silhouettes is None else self.silhouettes.inconsistency,
+            None if self.silhouettes is None else self.silhouettes.at_camera,
         )
 
     @property
@@ -243,7 +262,9 @@ class _Fit:
     def calibration(self) -> Calibration | None:
         """The cameras as they are corrected now; None if they are kept."""
         f = self.formation
-        return None if f is None else Calibration.of(self.scene, f.found(), f.pivot, f.points)
+        if f is None:
+            return None
+        return Calibration.of(self.scene, f.found(), f.pivot, f.points, since=self.by_silhouettes)
 
     def step(self) -> float:
         """One step of Adam on a batch of images; returns the loss."""
