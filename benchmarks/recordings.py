@@ -1,12 +1,13 @@
 """What a rough recording costs: scenes with ground truth, filmed worse.
 
-usage: python benchmarks/recordings.py OUT --scenes SCENE … [--cameras 11 4] [--faults none calibration pictures all]
+usage: python benchmarks/recordings.py OUT --scenes SCENE … [--cameras 11 4] [--jobs 2]
+                                       [--faults none calibration pictures all]
        python benchmarks/recordings.py OUT --table
 
 SCENE: a folder in the PAC-NeRF layout with gt/particles_F.npy. Faults: `calibration`: each camera is off by 0.15° about
 each axis, 2 mm along each axis and 0.3 % in focal length (standard deviations), no masks; `pictures`: noise of 4 grey
 levels, JPEG of quality 60, no masks; `all`: both. `none` keeps the masks. Every case runs `masiv identify --preset
-quick --fit-frames 12` and `masiv evaluate`.
+quick --fit-frames 12` and `masiv evaluate`. With several jobs each of them has one process.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import re
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -70,17 +72,23 @@ def _camera_error(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, flo
     return rotation, rng.normal(0, 2e-3, 3), 1 + float(rng.normal(0, 0.003))
 
 
-def run(scene: Path, out: Path, cameras: int, faults: str) -> None:
-    """Make the case, identify it and evaluate it; finished stages are kept."""
+def run(scene: Path, out: Path, cameras: int, faults: str, processes: int) -> None:
+    """Make the case, identify it and evaluate it; finished stages are kept. processes: of a job (0: all cores)."""
     case = out / f"{scene.name}.{cameras}.{faults}"
     data, folder = case / "scene", case / "run"
     if not (data / "all_data.json").is_file():
         shutil.rmtree(data, ignore_errors=True)
         degrade(scene, data, cameras, faults)
     masiv = [sys.executable, "-m", "masiv.cli.main"]
-    arguments = ["--out", str(folder), "--preset", "quick", "--fit-frames", "12"]
-    subprocess.run([*masiv, "identify", str(data), *arguments], check=True)
-    subprocess.run([*masiv, "evaluate", str(folder), "--truth", str(scene / "gt")], check=True)
+    config = case / "processes.yaml"
+    config.write_text(f"reconstruct: {{processes: {processes}}}\nidentify: {{processes: {processes}}}\n")
+    arguments = ["--out", str(folder), "--preset", "quick", "--fit-frames", "12", "--config", str(config)]
+    with (case / "log.txt").open("a") as log:
+        for command in (["identify", str(data), *arguments], ["evaluate", str(folder), "--truth", str(scene / "gt")]):
+            done = subprocess.run([*masiv, *command], stdout=log, stderr=subprocess.STDOUT)
+            print(f"{case.name}: masiv {command[0]} ended with {done.returncode}", flush=True)
+            if done.returncode:
+                return
 
 
 def table(out: Path) -> str:
@@ -112,12 +120,14 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, nargs="*", default=[])
     parser.add_argument("--cameras", type=int, nargs="*", default=[11, 4])
     parser.add_argument("--faults", choices=FAULTS, nargs="*", default=list(FAULTS))
+    parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--table", action="store_true")
     given = parser.parse_args()
-    for scene in given.scenes:
-        for cameras in given.cameras:
-            for faults in given.faults:
-                run(scene, given.out, cameras, faults)
+    cases = [(s, given.out, c, f) for s in given.scenes for c in given.cameras for f in given.faults]
+    processes = 1 if given.jobs > 1 else 0
+    with ThreadPoolExecutor(given.jobs) as pool:
+        for _ in pool.map(lambda case: run(*case, processes), cases):
+            pass
     if given.table:
         print(table(given.out))
 

@@ -20,7 +20,6 @@ from masiv.calibration.consistency import consistency, pair_errors
 from masiv.calibration.frontier import Outlines, TangencyResiduals, tangency_residuals
 from masiv.calibration.gauge import (
     POSE,
-    at_camera,
     camera_precision,
     displacement_jacobian,
     gauge_free_steps,
@@ -29,7 +28,7 @@ from masiv.calibration.gauge import (
 )
 from masiv.calibration.outline_points import OutlinePoints, outline_points
 from masiv.calibration.tangency import Outline, outline
-from masiv.scene.calibration import CameraCorrection
+from masiv.scene.calibration import CameraCorrection, corrected_camera
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
 
@@ -56,7 +55,6 @@ class SilhouetteFit:
     """
 
     corrections: tuple[CameraCorrection, ...]
-    at_camera: np.ndarray
     pivot: np.ndarray
     points: np.ndarray
     standard_errors_px: tuple[float, ...]
@@ -100,15 +98,10 @@ def fit_silhouettes(
     for k, jacobian in enumerate(problem.displacements):
         block = covariance[POSE * k : POSE * (k + 1), POSE * k : POSE * (k + 1)]
         errors.append(float(np.sqrt(np.einsum("pij,jk,pik->", jacobian, block, jacobian) / len(jacobian))))
-    return SilhouetteFit(
-        tuple(CameraCorrection(row[:3], row[3:6], float(row[6]), float(row[7])) for row in found),
-        np.stack([at_camera(c, points.pivot) @ row for c, row in zip(cameras, found, strict=True)]),
-        points.pivot,
-        points.points,
-        tuple(errors),
-        inconsistency.pixels,
-        noise,
-    )
+    corrections = tuple(CameraCorrection(row[:3], row[3:6], float(row[6]), float(row[7])) for row in found)
+    corrected = [corrected_camera(*one, points.pivot) for one in zip(cameras, corrections, strict=True)]
+    left = consistency(tuple(range(len(cameras))), pair_errors(corrected, [list(o) for o in outlines]))
+    return SilhouetteFit(corrections, points.pivot, points.points, tuple(errors), left.pixels, noise)
 
 
 class _Problem:

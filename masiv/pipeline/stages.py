@@ -35,8 +35,8 @@ def calibrated_scene(run: RunFolder, scene: Scene) -> Scene:
 def training_scene(run: RunFolder, scene: Scene) -> Scene:
     """``scene`` without held-out frames and cameras: what a stage that fits may see. Once there are Gaussians, its
     cameras are those that were refined with them, and masks that were estimated are theirs (``as_reconstructed``)."""
-    visible = scene.restricted(run.fit_frames, run.holdout_cameras)
-    if not run.done("reconstruct"):
+    visible = calibrated_scene(run, scene).restricted(run.fit_frames, run.holdout_cameras)
+    if not (scene.masks_estimated and run.done("reconstruct")):
         return visible
     from masiv.splat.rendered_masks import as_reconstructed
 

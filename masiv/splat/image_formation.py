@@ -29,8 +29,8 @@ EXPOSURE_STEP = 0.02
 class ImageFormation(torch.nn.Module):
     """Corrections of V cameras and of the exposure of their images at T frames; zero at first.
 
-    The cameras may have been corrected by their silhouettes. Pictures contain the silhouettes, so what these said is
-    where the fit begins and no prior: that is of the sum of both corrections, about the cameras as they were given.
+    The prior is about ``cameras``, which may have been corrected by their silhouettes; its width is what the
+    silhouettes still disagree.
 
     ``pose`` (V, 8) are coordinates in which a step of one moves the object by about a pixel in its picture, or by one
     prior standard deviation. From them a linear map makes rotation about the object's centre, translation, focal length
@@ -45,7 +45,6 @@ class ImageFormation(torch.nn.Module):
     translations: torch.Tensor
     pivots: torch.Tensor
     prior_deviations: torch.Tensor
-    corrected: torch.Tensor
 
     def __init__(
         self,
@@ -56,11 +55,9 @@ class ImageFormation(torch.nn.Module):
         points: np.ndarray,
         velocities: np.ndarray,
         inconsistency: np.ndarray | None = None,
-        corrected: np.ndarray | None = None,
     ) -> None:
         """points (P, 3) [m]: of the object, at all frames; velocities (P, 3) [m/s]: theirs. inconsistency (V,)
-        [pixels]: of the given silhouettes, see ``scaled_deviations``. corrected (V, 8): what was added to the given
-        cameras before, ``SilhouetteFit.at_camera``; None: nothing."""
+        [pixels]: of the silhouettes in ``cameras``, see ``scaled_deviations``."""
         super().__init__()
         self.fps, self.config, self.points = fps, config, points
         self.pivot = points.mean(axis=0)
@@ -79,8 +76,6 @@ class ImageFormation(torch.nn.Module):
         pivots = poses[:, :3, :3] @ self.pivot + poses[:, :3, 3]
         self.register_buffer("pivots", torch.tensor(pivots, dtype=torch.float32), persistent=False)
         self.register_buffer("prior_deviations", torch.tensor(deviations, dtype=torch.float32), persistent=False)
-        before = np.zeros((len(cameras), POSE)) if corrected is None else corrected
-        self.register_buffer("corrected", torch.tensor(before, dtype=torch.float32), persistent=False)
         self.pose = torch.nn.Parameter(torch.zeros(len(cameras), POSE))
         self.exposure = torch.nn.Parameter(torch.zeros(len(cameras), frame_count, 4))
 
@@ -153,9 +148,7 @@ class Corrections:
         at_camera = torch.cat([rotation, shift, self.cameras[:, 6:]], dim=1)
         gains = (self.exposures[..., :3] / config.log_gain).square().sum()
         offsets = (self.exposures[..., 3] / config.offset).square().sum()
-        return 0.5 * (
-            ((f.corrected + at_camera) / f.prior_deviations).square().sum() + f.exposure_weight * (gains + offsets)
-        )
+        return 0.5 * ((at_camera / f.prior_deviations).square().sum() + f.exposure_weight * (gains + offsets))
 
 
 def rotate(vector: torch.Tensor, points: torch.Tensor) -> torch.Tensor:

@@ -202,7 +202,6 @@ class _Fit:
             np.concatenate(surfaces),
             np.repeat(velocities, [len(points) for points in surfaces], axis=0),
             None if self.silhouettes is None else self.silhouettes.inconsistency,
-            None if self.silhouettes is None else self.silhouettes.at_camera,
         )
 
     @property
