@@ -41,11 +41,13 @@ class Scene:
     also checks that this scene contains it. ``background(view)``: picture (H, W, 3) uint8 of the empty scene, or None.
     mask_source: where masks come from, for messages. masks_estimated: from colours, none was given.
     correct_masks: makes the masks of the views of one frame agree, see ``masiv.hull.consistent_masks``; None for masks
-    that are given. hidden_views: cameras that are held out. fit_frames: of scene.yaml, if given. problems: sentences
-    for the user. velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a stage has estimated it for
-    silhouettes of views that show other times than the frame's. time_offsets [s]: of the cameras' clocks, empty if all
-    are exact. A picture was taken at frame / fps + offset. missing: (view, frame) of which there is no picture.
-    depth_noise: None if the pictures have no depth. ``load_cloud(frame)``: for a recording of point clouds, which has
+    that are given. load_with_mask: as ``load``, with a mask that is known, and mask_inputs: what masks follow from, as
+    plain values; both if masks are estimated. hidden_views: cameras that are held out. fit_frames: of scene.yaml, if
+    given. problems: sentences for the user. velocities (T, 3) [m/s]: mean velocity of the object at each frame, if a
+    stage has estimated it for silhouettes of views that show other times than the frame's. time_offsets [s]: of the
+    cameras' clocks, empty if all are exact. A picture was taken at frame / fps + offset. missing: (view, frame) of
+    which there is no picture. depth_noise: None if the pictures have no depth. ``load_cloud(frame)``: for a recording
+    of point clouds, which has
     no cameras; ``cloud(frame)`` also checks that this scene contains it.
     """
 
