@@ -9,7 +9,7 @@ from ring_scene import ring, spheres_scene
 from masiv.hull.carve import visual_hull
 from masiv.hull.consistent_masks import consistent_masks
 from masiv.hull.mask_quality import mask_quality
-from masiv.hull.volume import hull_ratios, volume_prior
+from masiv.hull.volume import hull_ratio, hull_ratios, volume_prior
 
 CENTRE, RADIUS = np.array([0.15, 0.5, -0.1]), 0.25
 ARM = np.array([0.15, 0.85, -0.1])
@@ -97,6 +97,18 @@ def test_the_volume_is_within_its_uncertainty(count):
     # Of all shapes a ball fills its hull best.
     assert abs(np.log(prior.volume / ball)) < 2.5 * prior.log_sd
     assert 0.02 < prior.log_sd < 0.2
+
+
+def test_the_hull_of_a_drawn_shape_is_that_of_its_exact_masks():
+    scene = spheres_scene(lambda frame: [(CENTRE, RADIUS)], cameras=ring(8), frame_count=2)
+    hull = visual_hull(scene, 0, resolution=56)
+    exact = hull.volume / (4 / 3 * np.pi * RADIUS**3)
+
+    def ball(points):
+        return np.linalg.norm(points, axis=1) < 1
+
+    drawn = hull_ratio(ball, scene, CENTRE, RADIUS, hull.spacing, np.random.default_rng(0))
+    assert drawn == pytest.approx(exact, rel=0.03)
 
 
 def test_more_cameras_leave_less_phantom_volume():

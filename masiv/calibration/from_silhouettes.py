@@ -154,7 +154,7 @@ class _Problem:
         jacobian = np.zeros((len(rows), len(self.cameras), POSE))
         for k in range(2):
             jacobian[rows, found.pairs[:, k]] = found.jacobian[:, k] / found.pixel_angles[:, None]
-        return jacobian.reshape(len(rows), -1) @ self.basis
+        return jacobian.reshape(len(rows), len(self.cameras) * POSE) @ self.basis
 
     def largest_move(self, step: np.ndarray) -> float:
         """RMS displacement of the object [pixels] by a change of the parameters, in the picture where it is largest."""

@@ -19,7 +19,7 @@ class TrajectoryConfig(BaseModel):
         description="mirror plane of the body at frame 0: its normal (world axes), auto (searched for) or none; the "
         "filled hull is cut to the part whose mirror image is in the hull",
     )
-    depth_tolerance: float = Field(1.5, gt=0, description="voxels in front of a rendered surface that stay filled")
+    depth_tolerance: float = Field(1.0, gt=0, description="voxels in front of a rendered surface that stay filled")
     carve_tolerance: float = Field(4.0, gt=0, description="pixels outside of a mask that count against a particle")
     carve_images: int = Field(8, ge=1, description="images (view and frame) against a particle that remove it")
     iterations: int = Field(600, ge=0, description="steps of fine-tuning")

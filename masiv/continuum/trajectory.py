@@ -118,8 +118,7 @@ def estimate_trajectory(
     mirror = first_mirror(scene, config, progress)
     start = fill_first_frame(scene, dynamic, config, prior, mirror)
     hull = hull_volume(scene, config)
-    # A body keeps its volume. So it is known more closely in the frames after the first: to half of that, an estimate.
-    same = None if prior is None else replace(prior, volume=start.volume, log_sd=prior.log_sd / 2)
+    same = None if prior is None else replace(prior, volume=start.volume)
     volumes = []
     for frame in range(1, scene.frame_count):
         progress("fill", frame, scene.frame_count - 1)
