@@ -48,9 +48,8 @@ FEWEST_DEGREES, MOST_DEGREES = 1.0, 30.0
 class SilhouetteFit:
     """Corrections of V cameras, in the order of ``Scene.views``.
 
-    corrections: about ``pivot`` (3,) [m]; at_camera (V, 8): the same, with the translation of the camera's own centre,
-    which the prior is about. points: of the object. standard_errors_px (V,): of the corrections that are left without
-    the gauge, as RMS displacement of the object. inconsistency (V,) [pixels]: of the given cameras,
+    corrections: about ``pivot`` (3,) [m]. points: of the object. standard_errors_px (V,): of the corrections that are
+    left without the gauge, as RMS displacement of the object. inconsistency (V,) [pixels]: of the corrected cameras,
     ``Consistency.pixels``. noise_px: scale of the outlines' errors.
     """
 
