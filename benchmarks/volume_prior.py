@@ -47,8 +47,8 @@ def main() -> None:
             hidden = tuple(view for view in scene.views if view not in views)
             prior = known_volume(scene.restricted(given.frames, hidden), config)
             if prior is not None:
-                ratio = prior.volume / volume
-                print(f"{path.name}, {len(views)} cameras: {ratio:.2f}, {np.log(ratio) / prior.log_sd:+.1f}", flush=True)
+                ratio, sd = prior.volume / volume, prior.log_sd
+                print(f"{path.name}, {len(views)} cameras: {ratio:.2f}, {np.log(ratio) / sd:+.1f}", flush=True)
 
 
 if __name__ == "__main__":
