@@ -150,6 +150,11 @@ class ForwardModel(ABC):
         found = zip(self.observations, self.fields(model, values), strict=True)
         return np.concatenate([e.whiten(f).ravel() for e, f in found])
 
+    def nuisance(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray:
+        """Derivatives (T, N, A, Q) of recording ``index`` by what is fitted to it alone for each model, such as the start
+        of a held-out flight. Q is 0 if there is nothing of the kind."""
+        return np.zeros((*self.observations[index].values.shape, 0))
+
     def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
         """What each of two or more finer grids changes (T, N, A) [m] of recording ``index``. Empty if there is no grid,
         or if its change says nothing; all recordings have as many. Raises NonFiniteError."""

@@ -202,6 +202,16 @@ class PointMassModel(ForwardModel):
             start = start + np.linalg.lstsq(slopes, (run.values[:, 0] - flights[0]).ravel(), rcond=None)[0]
         return start
 
+    def nuisance(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray:
+        """See ``ForwardModel``: by the start of a held-out run, which is found from the run itself."""
+        run = self.observations[index]
+        if run.fitted:
+            return super().nuisance(model, values, index)
+        start, steps = self.start_of(run, model, values), np.array([p.step for p in flight_parameters(run)])
+        starts = np.concatenate([start[None], start + np.diag(steps)])
+        flights = self.ballistic_positions(run, self.members(model, values, run), starts)
+        return np.moveaxis((flights[1:] - flights[0]) / steps[:, None, None], 0, -1)[:, None]
+
     def flight(self, run: TracksObservation, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Places (K, A) [m, world, measured axes] of the model at the run's times."""
         start = self.start_of(run, model, values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,7 +15,8 @@ class Observation:
     name: of the recording, different from those that it is fitted with. times (T,) [s], ascending. points (N, 3) [m]:
     where the points are at the start, in the axes of ``values``. values (T, N, A) [m]: what was measured in A axes, NaN
     if it is missing. noise_std [m]: of the measurement. residual_std (T,) [m]: by how much a model that lacks nothing
-    may differ from it. grid_corrections, each (T, N, A) [m]: what each finer grid changes along the motion of a model;
+    may differ from it. observation_std (T,) [m]: the part of that which is measurement; ``residual_std`` itself if not
+    given. grid_corrections, each (T, N, A) [m]: what each finer grid changes along the motion of a model;
     empty if that is not known. ``dataclasses.replace`` gives an observation another noise or split.
 
     Raises ValueError for shapes that do not fit together.
@@ -28,14 +29,18 @@ class Observation:
     fit_count: int
     noise_std: float
     residual_std: np.ndarray
+    observation_std: np.ndarray = field(default_factory=lambda: np.zeros(0))
     grid_corrections: tuple[np.ndarray, ...] = ()
 
     def __post_init__(self) -> None:
+        if not len(self.observation_std):
+            object.__setattr__(self, "observation_std", self.residual_std)
         instants, count, axes = self.values.shape
         expected = {
             "times": (self.times, (instants,)),
             "points": (self.points, (count, 3)),
             "residual_std": (self.residual_std, (instants,)),
+            "observation_std": (self.observation_std, (instants,)),
             **{f"grid_corrections[{k}]": (c, (instants, count, axes)) for k, c in enumerate(self.grid_corrections)},
         }
         for name, (array, shape) in expected.items():

@@ -42,7 +42,7 @@ class TracksObservation(Observation):
         count = int(kept.sum())
         return replace(
             self, times=self.times[kept], values=self.values[kept], residual_std=self.residual_std[kept],
-            fit_count=count if self.fitted else 0,
+            observation_std=self.observation_std[kept], fit_count=count if self.fitted else 0,
         )  # fmt: skip
 
 

@@ -1,0 +1,146 @@
+"""Modes of motion, and the marginal likelihood: against dense normal densities, and on draws of what it assumes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal, norm
+
+from masiv.inference.error_covariance import ErrorBlock, covariance, matern52
+from masiv.inference.evidence import jitter_of
+from masiv.inference.marginal_likelihood import ParameterPriors, SizePriors, _Likelihood, marginal
+from masiv.inference.motion_modes import MotionModes, rotations_since_start
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(0).normal(size=(60, 3)) * [0.3, 0.2, 0.1] + [1.0, 2.0, 3.0]
+
+
+def test_modes_are_orthonormal_and_hold_polynomials_of_third_degree(points):
+    modes = MotionModes.of(points, 3)
+    assert modes.names == ("translation", "rotation", "strain", "quadratic", "cubic")
+    basis = np.concatenate(modes.bases, axis=1)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(60), atol=1e-9)
+    x, y, z = (points - points.mean(0)).T
+    field = np.stack([x * y * z + 0.3 * x, y**2 - z, np.ones_like(x)], axis=1)[None]
+    found = modes.coefficients(field)
+    assert sum((c**2).sum() for c in found) == pytest.approx((field**2).sum(2).mean(), rel=1e-9)
+
+
+def test_rotation_of_a_turned_body_is_a_rotation_and_a_shift_stays_a_shift(points):
+    modes = MotionModes.of(points, 3)
+    start = points - points.mean(0)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    now = start @ turn.T
+    turned = rotations_since_start(points, now[None])
+    np.testing.assert_allclose(turned[0], turn, atol=1e-9)
+    spin = np.cross([0.3, -0.2, 0.5], now)
+    shift, rotation, *rest = modes.coefficients((spin + [1.0, 0.0, 0.0])[None], turned)
+    np.testing.assert_allclose(shift[0], [1.0, 0.0, 0.0], atol=1e-9)
+    assert (rotation**2).sum() == pytest.approx((spin**2).sum(1).mean())
+    assert max(np.abs(c).max() for c in rest) < 1e-9
+
+
+def test_points_on_a_line_and_one_point_have_fewer_modes():
+    line = np.zeros((5, 3))
+    line[:, 0] = np.arange(5.0)
+    modes = MotionModes.of(line, 3)
+    basis = np.concatenate(modes.bases, axis=1)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-9)
+    assert modes.bases[modes.names.index("rotation")].shape[1] == 2  # none about the line
+    assert MotionModes.of(np.zeros((1, 3)), 2).names == ("translation",)
+
+
+def block(rng, instants=9, modes=2, count=3, sizes=(1.0, 2.0)):
+    times = np.arange(instants) * 0.1
+    return ErrorBlock(
+        rng.normal(size=(instants, modes)), rng.normal(size=(instants, modes, count)),
+        np.abs(np.subtract.outer(times, times)), 0, sizes[0], np.linspace(1, 2, instants) * sizes[1],
+        np.linspace(0, 1, instants), 0.3,
+    )  # fmt: skip
+
+
+def test_marginal_likelihood_is_that_of_a_dense_normal_density():
+    rng = np.random.default_rng(1)
+    b = block(rng)
+    priors = ParameterPriors(np.array([0.0, -0.5, 0.2]), np.array([[0.1, 1.0, 4.0], [0.1, 0.2, 0.3]]))
+    logs = np.array([0.2, -0.3, np.log(0.25), 0.1])
+    with torch.no_grad():
+        terms, about, precision, _ = _Likelihood([b], priors, SizePriors.of([b])).terms(torch.tensor(logs))
+    values = np.exp(logs)
+    c = covariance(
+        torch.tensor(b.lags), torch.tensor(b.jitter * values[0]), torch.tensor(b.smooth * values[1]),
+        torch.tensor(values[2]), torch.tensor(b.grid * values[3]), b.grid_length,
+    ).numpy()  # fmt: skip
+    dense = np.kron(c, np.eye(2))
+    j, r = b.jacobian.reshape(18, 3), b.residual.reshape(18) + b.jacobian.reshape(18, 3) @ priors.mean
+    for k in range(2):
+        whole = dense + j @ np.diag(1 / priors.precision[k]) @ j.T
+        assert float(terms[k]) == pytest.approx(multivariate_normal.logpdf(r, np.zeros(18), whole), rel=1e-9)
+        gain = np.diag(1 / priors.precision[k]) @ j.T @ np.linalg.inv(whole)
+        np.testing.assert_allclose(about[k].numpy(), -gain @ r, atol=1e-9)
+        posterior = np.diag(1 / priors.precision[k]) - gain @ j @ np.diag(1 / priors.precision[k])
+        np.testing.assert_allclose(np.linalg.inv(precision[k].numpy()), posterior, atol=1e-9)
+
+
+def test_a_strength_that_cannot_be_negative_has_the_mass_above_zero():
+    rng = np.random.default_rng(2)
+    b = block(rng, count=1)
+    free, half = (ParameterPriors(np.array([0.3]), np.array([[0.5]]), p) for p in (None, 0))
+    logs = torch.zeros(4, dtype=torch.float64)
+    with torch.no_grad():
+        whole, about, precision, _ = _Likelihood([b], free, SizePriors.of([b])).terms(logs)
+        part = _Likelihood([b], half, SizePriors.of([b])).terms(logs)[0]
+    above = norm.sf(0.0, float(about[0, 0]), float(precision[0, 0, 0]) ** -0.5)
+    assert float(part[0] - whole[0]) == pytest.approx(np.log(2 * above))
+
+
+def test_matern_correlation_falls_from_one():
+    rho = matern52(torch.linspace(0, 5, 50, dtype=torch.float64))
+    assert rho[0] == 1 and (rho.diff() < 0).all() and rho[-1] < 1e-3
+
+
+def test_jitter_is_seen_under_a_smooth_motion():
+    t = np.linspace(0, 1, 60)[:, None]
+    smooth = np.concatenate([0.05 * np.sin(5 * t), 0.1 * t**2], axis=1)
+    noise = np.random.default_rng(0).normal(0, 1e-3, smooth.shape)
+    assert jitter_of(smooth + noise) == pytest.approx(1e-3, rel=0.25)
+    assert jitter_of(smooth[:5]) == 0.0
+
+
+def drawn(rng, slope, instants=40):
+    """A straight line with ``slope``, of which place and speed are unknown, with an effect that bends it; jitter and smooth
+    errors."""
+    times = np.linspace(0, 1, instants)
+    lags = np.abs(np.subtract.outer(times, times))
+    size, length = rng.uniform(0, 3), np.exp(rng.uniform(np.log(0.05), 0.0))
+    smooth = np.linalg.cholesky(np.exp(-0.5 * (lags / length) ** 2) + 1e-9 * np.eye(instants)) @ rng.normal(size=instants)
+    columns = np.stack([np.ones(instants), times, times**2], axis=1)[:, None]
+    residual = (rng.normal(size=instants) + size * smooth)[:, None] - slope * columns[..., 2]
+    return ErrorBlock(residual, columns, lags, 0, 1.0, np.ones(instants), np.zeros(instants), 0.3)
+
+
+SCALES = np.geomspace(0.3, 300, 5)
+
+
+def judged(b):
+    """log Bayes factor for the effect, its mean and standard deviation."""
+    flat = [1e-6, 1e-6]
+    without = ErrorBlock(b.residual, b.jacobian[..., :2], b.lags, 0, b.jitter, b.smooth, b.grid, b.grid_length)
+    sizes = SizePriors.of([b])
+    null = marginal([without], ParameterPriors(np.zeros(2), np.array([flat])), sizes)
+    effect = marginal([b], ParameterPriors(np.zeros(3), np.array([[*flat, s**-2] for s in SCALES])), sizes)
+    return effect.log_evidence - null.log_evidence, effect.mean[2], effect.covariance[2, 2] ** 0.5
+
+
+def test_nothing_is_named_without_an_effect_and_intervals_cover_with_one():
+    """A small edition of benchmarks/calibration.md: equal odds, so that a factor of 19 is 5 %."""
+    rng = np.random.default_rng(5)
+    factors = [judged(drawn(rng, 0.0))[0] for _ in range(60)]
+    assert sum(f > np.log(19) for f in factors) <= 6  # P(more than 6 of 60 at 5 %) = 3 %
+    found = [(s, *judged(drawn(rng, s))[1:]) for s in rng.choice([-1, 1], 60) * np.exp(rng.uniform(1, 4, 60))]
+    z = np.array([(mean - s) / sd for s, mean, sd in found])
+    assert 30 <= (np.abs(z) < 1).sum() <= 54  # 41 expected
+    assert (np.abs(z) < 2).sum() >= 51  # 57 expected
