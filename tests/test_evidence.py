@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import multivariate_normal, norm
 
-from masiv.inference.error_covariance import ErrorBlock, covariance, matern52
+from masiv.inference.error_covariance import BlockCovariance, ErrorBlock, matern52
 from masiv.inference.evidence import jitter_of
 from masiv.inference.marginal_likelihood import ParameterPriors, SizePriors, _Likelihood, marginal
 from masiv.inference.motion_modes import MotionModes, rotations_since_start
@@ -67,39 +66,53 @@ def test_marginal_likelihood_is_that_of_a_dense_normal_density():
     b = block(rng)
     priors = ParameterPriors(np.array([0.0, -0.5, 0.2]), np.array([[0.1, 1.0, 4.0], [0.1, 0.2, 0.3]]))
     logs = np.array([0.2, -0.3, np.log(0.25), 0.1])
-    with torch.no_grad():
-        terms, about, precision, _ = _Likelihood([b], priors, SizePriors.of([b])).terms(torch.tensor(logs))
+    terms = _Likelihood([b], priors, SizePriors.of([b])).terms(logs)
     values = np.exp(logs)
-    c = covariance(
-        torch.tensor(b.lags), torch.tensor(b.jitter * values[0]), torch.tensor(b.smooth * values[1]),
-        torch.tensor(values[2]), torch.tensor(b.grid * values[3]), b.grid_length,
-    ).numpy()  # fmt: skip
+    c = (values[0] * b.jitter) ** 2 * np.eye(9)
+    c += values[1] ** 2 * np.outer(b.smooth, b.smooth) * matern52(b.lags / values[2])
+    c += values[3] ** 2 * np.outer(b.grid, b.grid) * matern52(b.lags / b.grid_length)
+    np.testing.assert_allclose(BlockCovariance(b)(logs), c, rtol=1e-12)
     dense = np.kron(c, np.eye(2))
     j, r = b.jacobian.reshape(18, 3), b.residual.reshape(18) + b.jacobian.reshape(18, 3) @ priors.mean
     for k in range(2):
         whole = dense + j @ np.diag(1 / priors.precision[k]) @ j.T
-        assert float(terms[k]) == pytest.approx(multivariate_normal.logpdf(r, np.zeros(18), whole), rel=1e-9)
+        assert float(terms.logp[k]) == pytest.approx(multivariate_normal.logpdf(r, np.zeros(18), whole), rel=1e-9)
         gain = np.diag(1 / priors.precision[k]) @ j.T @ np.linalg.inv(whole)
-        np.testing.assert_allclose(about[k].numpy(), -gain @ r, atol=1e-9)
+        np.testing.assert_allclose(terms.mean[k], -gain @ r, atol=1e-9)
         posterior = np.diag(1 / priors.precision[k]) - gain @ j @ np.diag(1 / priors.precision[k])
-        np.testing.assert_allclose(np.linalg.inv(precision[k].numpy()), posterior, atol=1e-9)
+        np.testing.assert_allclose(terms.covariance[k], posterior, atol=1e-9)
 
 
 def test_a_strength_that_cannot_be_negative_has_the_mass_above_zero():
     rng = np.random.default_rng(2)
     b = block(rng, count=1)
     free, half = (ParameterPriors(np.array([0.3]), np.array([[0.5]]), p) for p in (None, 0))
-    logs = torch.zeros(4, dtype=torch.float64)
-    with torch.no_grad():
-        whole, about, precision, _ = _Likelihood([b], free, SizePriors.of([b])).terms(logs)
-        part = _Likelihood([b], half, SizePriors.of([b])).terms(logs)[0]
-    above = norm.sf(0.0, float(about[0, 0]), float(precision[0, 0, 0]) ** -0.5)
-    assert float(part[0] - whole[0]) == pytest.approx(np.log(2 * above))
+    whole, part = (_Likelihood([b], p, SizePriors.of([b])).terms(np.zeros(4)) for p in (free, half))
+    above = norm.sf(0.0, whole.mean[0, 0], whole.covariance[0, 0, 0] ** 0.5)
+    assert part.logp[0] - whole.logp[0] == pytest.approx(np.log(2 * above))
+
+
+@pytest.mark.parametrize("positive", [None, 1])
+def test_gradient_by_the_sizes_is_that_of_finite_differences(positive):
+    rng = np.random.default_rng(3)
+    blocks = [block(rng), block(rng, modes=4, sizes=(0.5, 1.0))]
+    precision = np.array([[0.1, 1.0, 4.0], [0.1, 0.2, 0.3]])
+    likelihood = _Likelihood(
+        blocks, ParameterPriors(np.array([0.0, -0.5, 0.2]), precision, positive), SizePriors.of(blocks), 0.3
+    )
+    at = np.array([0.2, -0.3, -1.0, 0.4])
+    _, gradient = likelihood.objective(at)
+    for k in range(4):
+        step = 1e-5 * np.eye(4)[k]
+        slope = (likelihood.objective(at + step)[0] - likelihood.objective(at - step)[0]) / 2e-5
+        assert gradient[k] == pytest.approx(slope, rel=1e-6)
 
 
 def test_matern_correlation_falls_from_one():
-    rho = matern52(torch.linspace(0, 5, 50, dtype=torch.float64))
-    assert rho[0] == 1 and (rho.diff() < 0).all() and rho[-1] < 1e-3
+    rho = matern52(np.linspace(0, 5, 50))
+    assert rho[0] == 1
+    assert (np.diff(rho) < 0).all()
+    assert rho[-1] < 1e-3
 
 
 def test_jitter_is_seen_under_a_smooth_motion():
@@ -116,7 +129,9 @@ def drawn(rng, slope, instants=40):
     times = np.linspace(0, 1, instants)
     lags = np.abs(np.subtract.outer(times, times))
     size, length = rng.uniform(0, 3), np.exp(rng.uniform(np.log(0.05), 0.0))
-    smooth = np.linalg.cholesky(np.exp(-0.5 * (lags / length) ** 2) + 1e-9 * np.eye(instants)) @ rng.normal(size=instants)
+    smooth = np.linalg.cholesky(np.exp(-0.5 * (lags / length) ** 2) + 1e-9 * np.eye(instants)) @ rng.normal(
+        size=instants
+    )
     columns = np.stack([np.ones(instants), times, times**2], axis=1)[:, None]
     residual = (rng.normal(size=instants) + size * smooth)[:, None] - slope * columns[..., 2]
     return ErrorBlock(residual, columns, lags, 0, 1.0, np.ones(instants), np.zeros(instants), 0.3)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 SQRT5 = 5**0.5
 
@@ -54,17 +53,46 @@ class ErrorSizes:
         return cls(values[:groups], values[groups : 2 * groups], values[2 * groups : 3 * groups], float(values[-1]))
 
 
-def matern52(distance: torch.Tensor) -> torch.Tensor:
+def matern52(distance: np.ndarray) -> np.ndarray:
     """Correlation at a ``distance`` in correlation lengths."""
     scaled = SQRT5 * distance
-    return (1 + scaled + scaled**2 / 3) * torch.exp(-scaled)
+    return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
 
 
-def covariance(
-    lags: torch.Tensor, jitter: torch.Tensor, smooth: torch.Tensor, length: torch.Tensor, grid: torch.Tensor,
-    grid_length: float,
-) -> torch.Tensor:  # fmt: skip
-    """C (T, T) [m²]. lags (T, T) [s]; jitter [m]; smooth, grid (T,) [m]; length, grid_length [s]."""
-    out = smooth[:, None] * smooth * matern52(lags / length)
-    out = out + grid[:, None] * grid * matern52(lags / grid_length)
-    return out + jitter**2 * torch.eye(len(lags), dtype=lags.dtype)
+def matern52_by_log_length(distance: np.ndarray) -> np.ndarray:
+    """Derivative of ``matern52`` by the logarithm of the correlation length."""
+    scaled = SQRT5 * distance
+    return scaled**2 / 3 * (1 + scaled) * np.exp(-scaled)
+
+
+class BlockCovariance:
+    """C (T, T) [m²] of ``block`` as a function of the logarithms of the sizes (3 G + 1,)."""
+
+    def __init__(self, block: ErrorBlock) -> None:
+        self.block = block
+        self._smooth = np.outer(block.smooth, block.smooth)
+        self._grid = np.outer(block.grid, block.grid) * matern52(block.lags / block.grid_length)
+
+    def _parts(self, logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        values, groups, g = np.exp(logs), len(logs) // 3, self.block.group
+        smooth = values[groups + g] ** 2 * self._smooth
+        return float(self.block.jitter * values[g]) ** 2, smooth, values[-1] ** 2 * self._grid
+
+    def _distance(self, logs: np.ndarray) -> np.ndarray:
+        return self.block.lags / np.exp(logs[2 * (len(logs) // 3) + self.block.group])
+
+    def __call__(self, logs: np.ndarray) -> np.ndarray:
+        jitter, smooth, grid = self._parts(logs)
+        return jitter * np.eye(len(grid)) + smooth * matern52(self._distance(logs)) + grid
+
+    def gradient(self, logs: np.ndarray, by_covariance: np.ndarray) -> np.ndarray:
+        """Gradient (3 G + 1,) of a function by the logarithms, from that by C (T, T)."""
+        jitter, smooth, grid = self._parts(logs)
+        distance = self._distance(logs)
+        groups, g = len(logs) // 3, self.block.group
+        out = np.zeros(len(logs))
+        out[g] = 2 * jitter * np.trace(by_covariance)
+        out[groups + g] = 2 * float((by_covariance * smooth * matern52(distance)).sum())
+        out[2 * groups + g] = float((by_covariance * smooth * matern52_by_log_length(distance)).sum())
+        out[-1] = 2 * float((by_covariance * grid).sum())
+        return out

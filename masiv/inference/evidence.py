@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from masiv.inference.error_covariance import ErrorBlock
+from masiv.inference.error_covariance import BlockCovariance, ErrorBlock
 from masiv.inference.linear_model import LinearModel
 from masiv.inference.marginal_likelihood import Marginal, ParameterPriors, SizePriors, marginal
 from masiv.inference.motion_modes import TRANSLATION, MotionModes, rotations_since_start
@@ -65,7 +65,9 @@ class _ObservationModes:
         floor = float(known.min()) / math.sqrt(count)
         jitter = [j if j > 0 else floor for j in jitter]
         smooth = np.full(len(kept), jitter[0]) if count == 1 else known
-        return cls(observation, modes, kept, turned, tuple(jitter), smooth, _grid_changes(observation, modes, kept, turned))
+        return cls(
+            observation, modes, kept, turned, tuple(jitter), smooth, _grid_changes(observation, modes, kept, turned)
+        )
 
     def blocks(self, field: np.ndarray, jacobian: np.ndarray) -> list[ErrorBlock]:
         """Of a residual field (T, N, A) [m] and its derivatives (T, N, A, P)."""
@@ -101,9 +103,7 @@ def _grid_changes(
     if not observation.grid_corrections:
         return tuple(np.zeros(len(kept)) for _ in modes.names)
     count = len(observation.grid_corrections)
-    apart = [
-        modes.coefficients((c - observation.grid_correction)[kept], turned) for c in observation.grid_corrections
-    ]
+    apart = [modes.coefficients((c - observation.grid_correction)[kept], turned) for c in observation.grid_corrections]
     more = math.sqrt((count + 1) / (count - 1))
     return tuple(
         more * np.maximum.accumulate(np.sqrt(np.mean([(c[g] ** 2).mean(1) for c in apart], axis=0)))
@@ -111,23 +111,49 @@ def _grid_changes(
     )
 
 
+def independent_series(residuals: Sequence[np.ndarray]) -> float:
+    """How many independent series the coefficients (T, K) of residuals are worth, of K: the participation ratio of their
+    covariance over the modes, corrected for how few instants show it.
+
+    What a simulation lacks moves all modes together: then they are one series, not K.
+    """
+    count = residuals[0].shape[1]
+    joined = np.concatenate(residuals)
+    power = np.linalg.svd(joined, compute_uv=False) ** 2
+    if power.sum() == 0.0:
+        return float(count)
+    inverse = float((power**2).sum() / power.sum() ** 2) - 1 / len(joined)
+    return 1 / max(inverse, 1 / count)
+
+
 @dataclass(frozen=True)
 class Evidence:
-    """Works out the evidence of models of ``observations``, with one expectation of errors for all of them."""
+    """Works out the evidence of models of ``observations``, with one expectation of errors for all of them. weight: see
+    ``marginal``."""
 
     observations: Sequence[Observation]
     parts: tuple[_ObservationModes, ...]
+    weight: float = 1.0
 
     @classmethod
     def of(cls, observations: Sequence[Observation], fields: Sequence[np.ndarray]) -> Evidence:
         """fields: the residual of the best model at all instants."""
         parts = tuple(_ObservationModes.of(e, f) for e, f in zip(observations, fields, strict=True))
-        return cls(tuple(observations), parts)
+        residuals = [
+            np.concatenate(part.modes.coefficients(f[part.kept], part.turned), axis=1)
+            for part, f in zip(parts, fields, strict=True)
+        ]
+        same = [r for r in residuals if r.shape[1] == residuals[0].shape[1]]
+        return cls(tuple(observations), parts, independent_series(same) / residuals[0].shape[1])
 
     def marginal(self, linear: LinearModel, terms: Sequence[EffectTerm]) -> Marginal:
         """The marginal likelihood of a model with the effects ``terms``."""
+        return self.marginal_with(linear, self.priors(linear, terms))
+
+    def marginal_with(self, linear: LinearModel, priors: ParameterPriors) -> Marginal:
+        """The same with other ``priors`` of its parameters."""
         blocks = self.blocks(linear)
-        return marginal(blocks, self.priors(linear, terms), SizePriors.of(blocks))
+        return marginal(blocks, priors, SizePriors.of(blocks), self.weight)
 
     def blocks(self, linear: LinearModel) -> list[ErrorBlock]:
         """Of all observations; columns are the model's parameters, then the nuisance of each observation."""
@@ -145,6 +171,7 @@ class Evidence:
         """Strengths: a mixture of normal densities about zero. All others: flat, over the range that is possible and that
         this recording could show."""
         names = [p.name for p in linear.parameters]
+        terms = [t for t in terms if all(p.name in names for p in t.strengths)]  # the others are known
         nuisance = sum(n.shape[-1] for n in linear.nuisance)
         strengths = {p.name for t in terms for p in t.strengths}
         units = {name: unit for t in terms for name, unit in t.units.items()}
@@ -166,7 +193,9 @@ class Evidence:
         one period in the record to two instants a period."""
         whole = p.fitted(p.upper) - p.fitted(p.lower)
         if unit == "m" and p.name.rsplit(".", 1)[-1] in ("x", "y", "z"):
-            reached = np.concatenate([np.nanmax(e.values, (0, 1)) - np.nanmin(e.values, (0, 1)) for e in self.observations])
+            reached = np.concatenate(
+                [np.nanmax(e.values, (0, 1)) - np.nanmin(e.values, (0, 1)) for e in self.observations]
+            )
             return min(whole, float(reached.max()))
         if unit == "Hz":
             times = self.observations[0].times
@@ -177,3 +206,48 @@ class Evidence:
 def strength_scales(p: Parameter) -> np.ndarray:
     """Scales of the prior of the strength ``p``, evenly in the logarithm."""
     return np.geomspace(p.step, max(abs(p.lower), abs(p.upper)), STRENGTH_SCALES)
+
+
+PREDICTIVE_DRAWS = 400
+"""Draws from which the posterior predictive probability is estimated."""
+
+
+def predictive_p(evidence: Evidence, linear: LinearModel, terms: Sequence[EffectTerm], seed: int = 0) -> float:
+    """Probability of a residual as large as that of the model, if nothing is missing and the errors are as expected (prior
+    predictive check; Box, J. R. Stat. Soc. A 143, 1980).
+
+    Residuals are compared after the fit that takes errors for what is expected of them. The modes of a draw are as
+    dependent on each other as those of the residual (``Evidence.weight``).
+    """
+    blocks, priors = evidence.blocks(linear), evidence.priors(linear, terms)
+    sizes = SizePriors.of(blocks)
+    covariances = [BlockCovariance(b) for b in blocks]
+    expected = [np.linalg.cholesky(c(sizes.mean)) for c in covariances]
+    columns = np.concatenate([_white(f, b.jacobian) for f, b in zip(expected, blocks, strict=True)])
+    columns = np.concatenate([columns, np.diag(np.sqrt(priors.precision[0]))])
+    basis = np.linalg.qr(columns)[0][: -columns.shape[1] or None] if columns.shape[1] else columns
+
+    def size(residuals: Sequence[np.ndarray]) -> float:
+        white = np.concatenate([_white(f, r) for f, r in zip(expected, residuals, strict=True)])
+        return float((white**2).sum() - ((basis.T @ white) ** 2).sum())
+
+    observed = size([b.residual for b in blocks])
+    rng = np.random.default_rng(seed)
+    larger = 0
+    for _ in range(PREDICTIVE_DRAWS):
+        logs = sizes.mean + sizes.sd * rng.normal(size=len(sizes.mean))
+        drawn = []
+        for b, c in zip(blocks, covariances, strict=True):
+            modes = b.residual.shape[1]
+            count = max(1, round(modes * evidence.weight))
+            series = np.linalg.cholesky(c(logs)) @ rng.normal(size=(len(b.lags), count))
+            directions = np.linalg.qr(rng.normal(size=(modes, count)))[0]
+            drawn.append(series @ directions.T * math.sqrt(modes / count))
+        larger += size(drawn) >= observed
+    return (larger + 1) / (PREDICTIVE_DRAWS + 1)
+
+
+def _white(factor: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Coefficients (T, K, ...) whitened and flat, (T K, ...)."""
+    white = np.linalg.solve(factor, values.reshape(len(values), -1))
+    return white.reshape(-1, *values.shape[2:])

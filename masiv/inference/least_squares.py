@@ -352,3 +352,11 @@ def standard_errors(
         p.name: float(math.sqrt(v) * (abs(values[p.name]) if p.log else 1.0)) if math.isfinite(v) else math.inf
         for p, v in zip(parameters, variances, strict=True)
     }
+
+
+def basis_of(a: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span those of ``a`` (M, P)."""
+    lengths = np.linalg.norm(a, axis=0)
+    seen = lengths > 1e-9 * lengths.max(initial=0.0)
+    u, s, _ = np.linalg.svd(a[:, seen] / lengths[seen], full_matrices=False)
+    return u[:, s > 1e-6 * s[0]] if len(s) else u

@@ -13,17 +13,20 @@ scales are spread evenly in the logarithm: a strength of any size is nearly as l
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
+from scipy.special import log_ndtr, logsumexp
 
-from masiv.inference.error_covariance import ErrorBlock, ErrorSizes, covariance
+from masiv.inference.error_covariance import BlockCovariance, ErrorBlock, ErrorSizes
 
 JITTER_SD, SMOOTH_SD, GRID_SD = 0.7, 1.0, 0.5
 """Standard deviations of the logarithms of the factors: the expected sizes are good to a factor of two or three."""
+STARTS = ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.5, 0.0), (-2.0, 0.0, 0.5, 0.0), (-2.0, -1.0, -1.0, 3.0))
+"""Where fits of the sizes begin, in standard deviations of their priors: jitter, smooth, length, grid."""
 LOG2PI = math.log(2 * math.pi)
 
 
@@ -75,6 +78,15 @@ class SizePriors:
         sd = np.concatenate([np.full(groups, JITTER_SD), np.full(groups, SMOOTH_SD), spreads, [GRID_SD]])
         return cls(mean, sd)
 
+    def starts(self) -> list[np.ndarray]:
+        """Sizes from which their fit begins: as expected, rough, smooth, and with more of another grid."""
+        groups = len(self.mean) // 3
+        out = []
+        for jitter, smooth, length, grid in STARTS:
+            shift = np.concatenate([np.full(groups, jitter), np.full(groups, smooth), np.full(groups, length), [grid]])
+            out.append(self.mean + shift * self.sd)
+        return out
+
 
 def _interval(lags: np.ndarray) -> float:
     return float(np.median(np.diag(lags, 1))) if len(lags) > 1 else 1.0
@@ -83,100 +95,127 @@ def _interval(lags: np.ndarray) -> float:
 class _Likelihood:
     """The marginal likelihood as a function of the logarithms of the sizes."""
 
-    def __init__(self, blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors) -> None:
-        self.blocks = [
-            (
-                b.group, b.jitter, torch.as_tensor(b.smooth), torch.as_tensor(b.grid), torch.as_tensor(b.lags),
-                b.grid_length, b.residual.shape[1],
-                torch.as_tensor(np.concatenate(
-                    [(b.residual + b.jacobian @ priors.mean)[:, :, None], b.jacobian], axis=2
-                ).reshape(len(b.residual), -1)),
-            )
-            for b in blocks
-        ]  # fmt: skip
-        self.columns = blocks[0].jacobian.shape[2] + 1
-        self.precision = torch.as_tensor(priors.precision)
-        self.positive = priors.positive
-        self.size_mean, self.size_sd = torch.as_tensor(sizes.mean), torch.as_tensor(sizes.sd)
-        self.groups = len(sizes.mean) // 3
+    def __init__(
+        self, blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, weight: float = 1.0
+    ) -> None:
+        self.covariances = [BlockCovariance(b) for b in blocks]
+        # The residual at the prior mean, and the derivatives: (T, K, 1 + P).
+        self.data = [
+            np.concatenate([(b.residual + b.jacobian @ priors.mean)[:, :, None], b.jacobian], axis=2) for b in blocks
+        ]
+        self.priors, self.sizes, self.weight = priors, sizes, weight
 
-    def terms(self, logs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """log p (S,) of each component, and of it the mean (S, P) about the prior mean, and precision (S, P, P)."""
-        values, groups = torch.exp(logs), self.groups
-        gram = torch.zeros((self.columns,) * 2, dtype=torch.float64)
-        constant = torch.zeros((), dtype=torch.float64)
-        for group, jitter, smooth, grid, lags, grid_length, modes, data in self.blocks:
-            c = covariance(
-                lags, jitter * values[group], smooth * values[groups + group], values[2 * groups + group],
-                grid * values[-1], grid_length,
-            )  # fmt: skip
-            factor = torch.linalg.cholesky(c)
-            white = torch.linalg.solve_triangular(factor, data, upper=False).reshape(-1, self.columns)
-            gram = gram + white.T @ white
-            constant = constant - modes * (torch.log(factor.diagonal()).sum() + 0.5 * len(lags) * LOG2PI)
-        b = gram[1:, 0]
-        a = gram[1:, 1:] + torch.diag_embed(self.precision)
-        if a.shape[1] == 0:
-            return (constant - 0.5 * gram[0, 0])[None], torch.zeros(1, 0), a, constant
-        factor = torch.linalg.cholesky(a)
-        solved = torch.cholesky_solve(b[None, :, None].expand(len(a), -1, 1), factor)[:, :, 0]
-        out = constant - 0.5 * (gram[0, 0] - solved @ b)
-        out = out - torch.log(factor.diagonal(dim1=1, dim2=2)).sum(1) + 0.5 * torch.log(self.precision).sum(1)
-        if self.positive is not None:
-            k = self.positive
-            inverse = torch.cholesky_inverse(factor)
-            # The prior has half of its mass above zero.
-            z = (self.offset - solved[:, k]) / torch.sqrt(inverse[:, k, k])
-            out = out + torch.special.log_ndtr(z) + math.log(2.0)
-        return out, -solved, a, constant
+    def terms(self, logs: np.ndarray, *, gradient: bool = False) -> _Terms:
+        """Of each component of the prior; with the gradient of the sum of all by ``logs`` if asked for."""
+        columns = self.data[0].shape[2]
+        gram, constant = np.zeros((columns, columns)), 0.0
+        whitened = []
+        for covariance, data in zip(self.covariances, self.data, strict=True):
+            factor = cholesky(covariance(logs), lower=True, check_finite=False)
+            flat = data.reshape(len(data), -1)
+            white = solve_triangular(factor, flat, lower=True, check_finite=False)
+            rows = white.reshape(-1, columns)
+            gram += rows.T @ rows
+            constant -= data.shape[1] * (np.log(factor.diagonal()).sum() + 0.5 * len(data) * LOG2PI)
+            whitened.append((factor, white))
+        gram *= self.weight
+        logp, mean, covariance, by_gram = self._components(gram)
+        terms = _Terms(self.weight * constant + logp, mean, covariance)
+        if not gradient:
+            return terms
+        share = np.exp(terms.logp - logsumexp(terms.logp))
+        slope = np.tensordot(share, by_gram, 1)
+        out = np.zeros(len(logs))
+        for block, data, (factor, white) in zip(self.covariances, self.data, whitened, strict=True):
+            solved = solve_triangular(factor, white, lower=True, trans="T", check_finite=False)
+            shaped = solved.reshape(data.shape)
+            spread = (shaped @ slope).reshape(len(data), -1) @ solved.T
+            inverse = cho_solve((factor, True), np.eye(len(data)), check_finite=False)
+            out += block.gradient(logs, -self.weight * (0.5 * data.shape[1] * inverse + spread))
+        return replace(terms, gradient=out)
 
-    offset = 0.0
-    """Prior mean of the positive parameter, which is zero."""
+    def _components(self, gram: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """log p but for a constant (S,), mean (S, P) about the prior mean and covariance (S, P, P) of each component,
+        and the gradient (S, 1 + P, 1 + P) of log p by ``gram``."""
+        precision = self.priors.precision
+        count, size = precision.shape
+        covariance = np.linalg.inv(gram[1:, 1:] + precision[:, :, None] * np.eye(size))
+        solved = covariance @ gram[1:, 0]
+        determinant = np.linalg.slogdet(covariance)[1] if size else np.zeros(count)
+        logp = -0.5 * (gram[0, 0] - solved @ gram[1:, 0]) + 0.5 * (determinant + np.log(precision).sum(1))
+        direction = np.concatenate([np.ones((count, 1)), -solved], axis=1)
+        slope = -0.5 * direction[:, :, None] * direction[:, None, :]
+        slope[:, 1:, 1:] -= 0.5 * covariance
+        if self.priors.positive is not None:
+            k = self.priors.positive
+            column = covariance[:, k]
+            sd = np.sqrt(column[:, k])
+            z = -solved[:, k] / sd  # the prior, of mean zero, has half of its mass above zero
+            logp = logp + log_ndtr(z) + math.log(2)
+            by_z = np.exp(-0.5 * z**2 - 0.5 * LOG2PI - log_ndtr(z))
+            by_right = -column / sd[:, None]
+            both = column[:, :, None] * solved[:, None, :]
+            by_matrix = 0.5 * (both + both.swapaxes(1, 2)) / sd[:, None, None]
+            by_matrix -= (solved[:, k] / (2 * sd**3))[:, None, None] * column[:, :, None] * column[:, None, :]
+            slope[:, 1:, 1:] += by_z[:, None, None] * by_matrix
+            slope[:, 1:, 0] += 0.5 * by_z[:, None] * by_right
+            slope[:, 0, 1:] += 0.5 * by_z[:, None] * by_right
+        return logp, -solved, covariance, slope
 
-    def log_posterior(self, logs: torch.Tensor) -> torch.Tensor:
-        """log p of the residual and of the sizes."""
-        terms = self.terms(logs)[0]
-        prior = -0.5 * (((logs - self.size_mean) / self.size_sd) ** 2).sum()
-        return torch.logsumexp(terms, 0) - math.log(len(terms)) + prior
+    def objective(self, logs: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus the logarithm of the posterior of the sizes, and its gradient."""
+        terms = self.terms(logs, gradient=True)
+        assert terms.gradient is not None
+        z = (logs - self.sizes.mean) / self.sizes.sd
+        value = logsumexp(terms.logp) - math.log(len(terms.logp)) - 0.5 * float(z @ z)
+        return -float(value), -(terms.gradient - z / self.sizes.sd)
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """logp (S,), mean (S, P) about the prior mean, covariance (S, P, P) of each component; gradient of log p."""
+
+    logp: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    gradient: np.ndarray | None = None
 
 
 def marginal(
-    blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, start: np.ndarray | None = None
+    blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, weight: float = 1.0
 ) -> Marginal:
-    """The marginal likelihood of ``blocks``, over all of them. start (3 G + 1,): logarithms of sizes to begin with."""
-    likelihood = _Likelihood(blocks, priors, sizes)
-
-    def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
-        x = torch.tensor(logs, requires_grad=True)
-        value = -likelihood.log_posterior(x)
-        value.backward()
-        assert x.grad is not None
-        return value.item(), x.grad.numpy()
-
+    """The marginal likelihood of ``blocks``, over all of them. weight: power of the likelihood, below 1 if the modes are
+    not independent of each other (composite likelihood; Varin, Reid & Firth 2011)."""
+    likelihood = _Likelihood(blocks, priors, sizes, weight)
     reach = 6.0 * sizes.sd
-    found = minimize(
-        objective, sizes.mean if start is None else start, jac=True, method="L-BFGS-B",
-        bounds=list(zip(sizes.mean - reach, sizes.mean + reach, strict=True)), options={"maxiter": 200},
-    )  # fmt: skip
-    logs = torch.tensor(found.x)
-    hessian = _hessian(objective, found.x, sizes.sd)
+    bounds = list(zip(sizes.mean - reach, sizes.mean + reach, strict=True))
+    # The posterior has several modes: a rough residual is jitter, or smooth errors of a short time.
+    found = min(
+        (
+            minimize(likelihood.objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 200})
+            for start in sizes.starts()
+        ),
+        key=lambda result: result.fun,
+    )
+    hessian = _hessian(likelihood.objective, found.x, sizes.sd)
     # Volume of the posterior of the sizes over that of their prior.
     volume = -0.5 * np.linalg.slogdet(hessian * np.outer(sizes.sd, sizes.sd))[1]
-    with torch.no_grad():
-        terms, about_mean, precision, _ = likelihood.terms(logs)
-        weights = torch.softmax(terms, 0)
-        covariances = torch.linalg.inv(precision) if precision.shape[1] else precision
-        mean = weights @ about_mean
-        apart = about_mean - mean
-        spread = torch.einsum("s,sij->ij", weights, covariances + apart[:, :, None] * apart[:, None, :])
+    terms = likelihood.terms(found.x)
+    weights = np.exp(terms.logp - logsumexp(terms.logp))
+    mean = weights @ terms.mean
+    apart = terms.mean - mean
+    spread = np.tensordot(weights, terms.covariance + apart[:, :, None] * apart[:, None, :], 1)
     return Marginal(
-        -float(found.fun) + float(volume), priors.mean + mean.numpy(), spread.numpy(), weights.numpy(),
-        ErrorSizes.of_logarithms(found.x), found.x,
+        -float(found.fun) + float(volume), priors.mean + mean, spread, weights, ErrorSizes.of_logarithms(found.x),
+        found.x,
     )  # fmt: skip
 
 
-def _hessian(objective, at: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Second derivatives of the objective by differences of its gradient, at least those of the prior alone."""
+Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
+
+
+def _hessian(objective: Objective, at: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Second derivatives of the objective by differences of its gradient; a tenth of those of the prior at the least."""
     count = len(at)
     out = np.zeros((count, count))
     for k in range(count):

@@ -9,12 +9,11 @@ observed, and the others.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from masiv.inference.smooth_noise import SmoothNoise, covariance_of, estimate_smooth_noise
 from masiv.observations.base import Observation
 
 OBSERVATION_LIMITED_RATIO = 1.5
@@ -79,53 +78,10 @@ class NoiseModel:
         parts = [ratio[e.fit_count :] for ratio, e in ratios if e.holds_out]
         return np.concatenate(parts) if parts else np.zeros(0)
 
-    # -- correlations --------------------------------------------------------------------------------------------
-
-    def estimator_covariance(
-        self, residual: np.ndarray, jacobian: np.ndarray, estimator: np.ndarray
-    ) -> np.ndarray | None:
-        """Covariance (Q, Q) of ``estimator`` (M, Q) times a noise as smooth as what the fit with ``jacobian`` (M, P)
-        left, ``residual`` (M,) [m]. None if the residual is too short, or has too few points, to tell how smooth.
-
-        The smoothness is that of the observation-limited instants, of the observation's errors alone. Elsewhere
-        residuals are as much larger as they are found to be.
-        """
-        total = np.zeros((estimator.shape[1],) * 2)
-        for observation, part in self._parts(residual.size):
-            field = residual[part].reshape(observation.fit_count, len(observation.points), -1)
-            noise, scale = _smooth_noise(field, jacobian[part].reshape(*field.shape, -1), observation)
-            if noise is None:
-                return None
-            total += covariance_of(estimator[part].reshape(*field.shape, -1), noise, observation.points, scale)
-        return total
-
-    def _parts(self, size: int) -> Iterator[tuple[Observation, slice]]:
-        """What of a residual of ``size`` is of which observation; all are measured in as many axes."""
-        fitted = [e for e in self.observations if e.fit_count]
-        axes = size // sum(e.fit_count * len(e.points) for e in fitted)
-        begin = 0
-        for e in fitted:
-            end = begin + e.fit_count * len(e.points) * axes
-            yield e, slice(begin, end)
-            begin = end
-
 
 def observation_limited(observation: Observation) -> np.ndarray:
     """Which fitted instants (fit_count,) are simulated as well as they are observed."""
     return observation.residual_std[: observation.fit_count] < OBSERVATION_LIMITED_RATIO * observation.noise_std
-
-
-def _smooth_noise(
-    field: np.ndarray, sensitivities: np.ndarray, observation: Observation
-) -> tuple[SmoothNoise | None, np.ndarray]:
-    """The noise in a residual ``field`` (T, N, A), and how much larger it is at each instant (T,)."""
-    known = observation_limited(observation)
-    noise = estimate_smooth_noise(field[known], sensitivities[known], observation.points)
-    if noise is None:  # too few instants of that regime: all of them
-        return estimate_smooth_noise(field, sensitivities, observation.points), np.ones(len(field))
-    squares = (field**2).mean((1, 2))
-    here, there = (float(squares[part].mean()) if part.any() else 0.0 for part in (known, ~known))
-    return noise, np.where(known, 1.0, math.sqrt(max(1.0, there / here)))
 
 
 def effective_samples(field: np.ndarray, points: np.ndarray) -> int:

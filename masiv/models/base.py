@@ -174,7 +174,6 @@ class ForwardModel(ABC):
         the recordings helps."""
         return False
 
-    def objections(self, before: FittedModel, after: FittedModel, term: EffectTerm, min_gain: float) -> list[str]:
-        """Reasons of physics, or of single bodies, against adding ``term``, in words. min_gain: part of the held-out
-        error that it must remove."""
+    def impossible(self, fitted: FittedModel, term: EffectTerm) -> list[str]:
+        """Why ``term`` cannot act as ``fitted`` has it, or could not be told from a simpler one, in words."""
         return []

@@ -292,9 +292,9 @@ class ClampedBodyModel(ForwardModel):
         fitted = [field[: run.fit_count] for run, field in zip(self.observations, fields, strict=True)]
         return rms_mm(fitted) >= PHASE_LOST * rms_mm(swing)
 
-    def objections(self, before: FittedModel, after: FittedModel, term: EffectTerm, min_gain: float) -> list[str]:
+    def impossible(self, fitted: FittedModel, term: EffectTerm) -> list[str]:
         """What the medium cannot do."""
-        theta = torch.tensor([after.values[p.name] for p in term.parameters], dtype=torch.float64)
+        theta = torch.tensor([fitted.values[p.name] for p in term.parameters], dtype=torch.float64)
         per_body = effect_named(term.effect).per_body
         why = per_body.violates_bounds(theta, self.drag_body) if per_body else None
         return [] if why is None else [why]

@@ -127,9 +127,9 @@ class FreeBodyModel(ForwardModel):
             shorter.append(FreeBodyModel(self.setups, self.held).with_observations(cut))
         return shorter
 
-    def objections(self, before: FittedModel, after: FittedModel, term: EffectTerm, min_gain: float) -> list[str]:
+    def impossible(self, fitted: FittedModel, term: EffectTerm) -> list[str]:
         """Whether the fitted frames are too few to tell the effect from others."""
-        theta = torch.tensor([after.values[p.name] for p in term.parameters])
+        theta = torch.tensor([fitted.values[p.name] for p in term.parameters])
         times = [e.fit_frames / r.body.scene.fps for e, r in zip(self.observations, self.setups, strict=True)]
         places = torch.cat([torch.as_tensor(e.seen_at_frames()).reshape(-1, 3) for e in self.observations])
         reason = effect_named(term.effect).hints.identifiability_issue(theta, max(times), places)

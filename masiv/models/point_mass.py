@@ -233,19 +233,11 @@ class PointMassModel(ForwardModel):
                 own.setdefault(run.body, []).append(field)
         return {body: rms_mm(found) for body, found in own.items()}
 
-    def objections(self, before: FittedModel, after: FittedModel, term: EffectTerm, min_gain: float) -> list[str]:
-        """A term of all must make no body worse, one of some must make those better, on runs that were held out."""
-        old, new = (self.by_body(f.model, f.values, fitted=False) for f in (before, after))
-        out = [f"{b}: {why}" for b in term.bodies or self.bodies if (why := self._impossible(after, term, b))]
-        for body in old:
-            gain = 1 - new[body] / old[body]
-            if term.bodies == (body,) and gain < min_gain:
-                out.append(f"{body}: {old[body]:.0f} mm held out become {new[body]:.0f} mm")
-            elif gain < -min_gain:
-                out.append(f"{body} does not share it: {old[body]:.0f} mm held out become {new[body]:.0f} mm")
-        return out
+    def impossible(self, fitted: FittedModel, term: EffectTerm) -> list[str]:
+        """What the medium cannot do to a body."""
+        return [f"{b}: {why}" for b in term.bodies or self.bodies if (why := self._forbidden(fitted, term, b))]
 
-    def _impossible(self, fitted: FittedModel, term: EffectTerm, body: str) -> str | None:
+    def _forbidden(self, fitted: FittedModel, term: EffectTerm, body: str) -> str | None:
         """What the medium cannot do to ``body``."""
         theta = torch.tensor([fitted.values[p.name] for p in self.parameters_of(term, body)], dtype=torch.float64)
         per_body = effect_named(term.effect).per_body

@@ -25,3 +25,16 @@ def _with_others(entry: Mapping[str, Any]) -> str:
 def words(name: str) -> str:
     """A name of the code for people."""
     return name.replace("_", " ")
+
+
+def outcome(row: Mapping[str, Any]) -> str:
+    """What became of a refit, in words."""
+    if row["accepted"]:
+        return "accepted"
+    if row["impossible"]:
+        return "; ".join(row["impossible"])
+    factor = row["log_bayes_factor"]
+    known = "" if factor is None else f"log Bayes factor {factor:.1f}"
+    if not row["converged"]:
+        known += ", not converged" if known else "not converged"
+    return known or "not weighed"

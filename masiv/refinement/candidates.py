@@ -13,10 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from masiv.errors import NonFiniteError
-from masiv.inference.least_squares import free_parameters
+from masiv.inference.least_squares import basis_of, free_parameters
 from masiv.inference.model_fit import ModelFit
 from masiv.inference.robust import soft_l1_mean_square, soft_l1_weight
-from masiv.inference.smooth_noise import basis_of
 from masiv.models.base import EffectTerm, ForwardModel
 from masiv.models.parameters import Parameter
 

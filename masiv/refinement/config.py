@@ -4,21 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-RENAMED_KEYS = {
-    "above_noise": "noise_threshold",
-    "unexplained": "max_reduced_chi",
-    "least_explained": "min_explained",
-    "least_gain": "min_gain",
-    "simple_gain": "single_parameter_gain",
-    "decisive": "decisive_variance_ratio",
-    "plain_sigmas": "min_gls_z",
-    "least_bic": "min_bic_gain",
-    "clear_bic": "clear_bic_gain",
-    "least_sigmas": "min_strength_z",
-    "least_apart": "min_vuong_z",
-    "confusable": "confusable_correlation",
-    "second_look": "search_second_effect",
-}
+RENAMED_KEYS: dict[str, str] = {}
 """Keys of earlier versions: old name -> new name."""
 
 
@@ -43,63 +29,19 @@ class RefineConfig(BaseModel):
     baseline_rollouts: int = Field(45, ge=2, description="rollouts of each stage of a law's fit without effects")
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")
-    noise_threshold: float = Field(
-        1.2, ge=0,
-        description="residual over the noise of the observation below which nothing is looked for, if the reduced chi "
-        "of the held-out instants is below max_reduced_chi",
+    max_null_probability: float = Field(
+        0.05, gt=0, lt=1,
+        description="probability of a model with fewer effects below which one more is named",
+    )  # fmt: skip
+    min_predictive_p: float = Field(
+        0.01, ge=0, lt=1,
+        description="probability of a residual as large as that of the final model, below which it is unexplained "
+        "(prior predictive check)",
     )  # fmt: skip
     tracking_error: float = Field(
         0.4, ge=0, le=1,
         description="error of points that are followed in pictures, over their distance from a rigid motion",
     )  # fmt: skip
-    max_reduced_chi: float = Field(
-        1.75, ge=1,
-        description="reduced chi (residual over its standard deviation: noise and discretization) above which "
-        "something is missing: a further effect is looked for, and if none is accepted, the residual is unexplained",
-    )  # fmt: skip
-    search_second_effect: bool = Field(
-        True,
-        description="if an effect was accepted and the reduced chi is below max_reduced_chi, look for one of one "
-        "parameter in addition",
-    )  # fmt: skip
     min_explained: float = Field(
         0.1, ge=0, le=1, description="part of the residual that an effect must explain in the ranking to be fitted"
-    )
-    min_gain: float = Field(
-        0.15, ge=0, le=1,
-        description="part of the held-out error that an effect must remove if it explains more of the fitted motion "
-        "than noise and discretization could change",
-    )  # fmt: skip
-    decisive_gain: float = Field(0.5, ge=0, le=1, description="the same if it explains next to nothing of that")
-    single_parameter_gain: float = Field(
-        0.25, ge=0, le=1, description="the same for an effect of one parameter, if the criterion is clear"
-    )
-    decisive_variance_ratio: float = Field(
-        4.0, ge=1,
-        description="variance that an effect must explain over that of the noise, in the instants that are simulated "
-        "as well as observed, to be accepted although held-out frames confirm little and contradict nothing",
-    )  # fmt: skip
-    min_gls_z: float = Field(
-        6.0, ge=0,
-        description="standard deviations of a noise as smooth as the residual above which a variance ratio of 1 is "
-        "enough there",
-    )  # fmt: skip
-    min_bic_gain: float = Field(
-        6.0, ge=0,
-        description="by how much an effect must lower the information criterion, to which held-out frames are one "
-        "sample more; from 6 on evidence is called strong (Kass and Raftery, JASA 90, 1995)",
-    )  # fmt: skip
-    clear_bic_gain: float = Field(
-        20.0, ge=0,
-        description="gain of the criterion above which held-out frames need to confirm less: of an effect of one "
-        "parameter, and of a second one",
-    )  # fmt: skip
-    min_strength_z: float = Field(3.0, ge=0, description="standard errors that a strength must lie from zero")
-    min_vuong_z: float = Field(
-        2.0, ge=0,
-        description="standard deviations of smooth noise above which an effect is distinguished from another that "
-        "explains less",
-    )  # fmt: skip
-    confusable_correlation: float = Field(
-        0.95, gt=0, le=1, description="correlation of two patterns above which two effects are confusable"
     )

@@ -15,13 +15,14 @@ from masiv.inference.model_fit import ModelFit, split_fields
 from masiv.models.base import EffectTerm
 from masiv.models.free_body import GRID_CORRECTION
 from masiv.observations.base import rms_mm
-from masiv.refinement.answer import answer
+from masiv.refinement.answer import answer, outcome
 from masiv.refinement.candidates import Candidate
-from masiv.refinement.result import ADDED, NOTHING, BodyResult, Proposal, RefineResult, SharedFit
-from masiv.refinement.rounds import Round, Trial, similar_to_accepted
+from masiv.refinement.result import ADDED, NOTHING, RANKED, BodyResult, Proposal, RefineResult, SharedFit
+from masiv.refinement.limits import UpperLimit
+from masiv.refinement.rounds import Round, Trial, alternatives
 from masiv.refinement.search import DISCREPANCY_FORCE
 
-SCHEMA = 2
+SCHEMA = 3
 WORST_POINTS = 0.1
 """Part of the points whose middle is the place where a residual is largest."""
 
@@ -39,6 +40,10 @@ def document(result: RefineResult) -> dict[str, Any]:
         "grid_change": {"before": _grid_change(result, before), "after": _grid_change(result, after)},
         "reduced_chi": {"before": result.reduced_chi(before), "after": result.reduced_chi(after)},
         "residual_mm": {"fit": before.fit_mm, "held_out": before.held_out_mm},
+        "null_probability": result.search.null_probability,
+        "predictive_p": dict(result.predictive_p),
+        "credible_set": _credible_set(first),
+        "upper_limits": [_upper_limit(result, limit) for limit in result.search.limits],
         "candidates": [_candidate(result, c, first) for c in first.candidates] if first else [],
         "not_ranked": [_failure(result, n, why) for n, why in first.ranking.not_ranked.items()] if first else [],
         "accepted": [_accepted(result, term, after) for term in result.accepted],
@@ -89,6 +94,33 @@ def _grid_change(result: RefineResult, fitted: ModelFit) -> float | None:
     return float(np.mean(known)) if known else None
 
 
+def _credible_set(first: Round | None) -> list[dict[str, Any]]:
+    """Sets of effects of the first round, the most probable first."""
+    if first is None or first.posterior is None:
+        return []
+    sets = first.posterior.credible_set()
+    return [{"effects": sorted(effects), "probability": p} for effects, p in sets.items()]
+
+
+def _probability(first: Round, effect: str) -> float | None:
+    """Of the model with ``effect`` alone; None if it was not fitted."""
+    if first.posterior is None:
+        return None
+    return first.posterior.sets().get(frozenset({*first.base.model.effects, effect}))
+
+
+def _upper_limit(result: RefineResult, limit: UpperLimit) -> dict[str, Any]:
+    term = result.forward_model.term(limit.effect)
+    return {
+        "effect": term.effect,
+        "scope": scope_of(term),
+        "strength": limit.strength,
+        "unit": term.units[term.strengths[0].name],
+        "motion_mm": limit.motion_mm,
+        "determined": limit.determined,
+    }
+
+
 def _candidate(result: RefineResult, candidate: Candidate, first: Round) -> dict[str, Any]:
     term = result.forward_model.term(candidate.effect)
     sizes = [candidate.theta[p.name] for p in term.strengths]
@@ -102,7 +134,7 @@ def _candidate(result: RefineResult, candidate: Candidate, first: Round) -> dict
         "unit": term.units[term.strengths[0].name],
         "stderr": errors[0] if one else math.hypot(*errors),
         "parameters": {_short(term, n): v for n, v in candidate.theta.items()},
-        "confusable_with": first.confusable.get(candidate.effect, []),
+        "probability": _probability(first, candidate.effect),
         "looks_like": effect_named(term.effect).looks_like,
     }
 
@@ -122,12 +154,14 @@ def _parameters(term: EffectTerm, fitted: ModelFit) -> dict[str, Any]:
 
 def _accepted(result: RefineResult, term: EffectTerm, fitted: ModelFit) -> dict[str, Any]:
     place = result.places.get(term.name)
+    others = alternatives(term.name, fitted, result.search.rounds)
     return {
         "effect": term.effect,
         "scope": scope_of(term),
         "bodies": list(term.bodies),
         **_parameters(term, fitted),
-        **similar_to_accepted(term.name, result.search.rounds),
+        "indistinguishable_from": list(others),
+        "alternatives": others,
         **({} if place is None else {"place_in_body": {"value": list(place), "unit": "m"}}),
     }
 
@@ -175,9 +209,10 @@ def _refit(result: RefineResult, done: Round, trial: Trial) -> dict[str, Any]:
             _short(term, p.name): {"value": fitted.values[p.name], "stderr": fitted.stderr.get(p.name)}
             for p in term.parameters
         },
-        "information_gain": fitted.bic_gain(done.base),
+        "log_bayes_factor": trial.log_bayes_factor,
         "accepted": done.accepted is trial,
-        "objections": list(trial.objections),
+        "converged": trial.converged,
+        "impossible": list(trial.impossible),
     }
 
 
@@ -232,7 +267,7 @@ def _shared(fit: SharedFit) -> dict[str, Any]:
         "effect": fit.term.effect, "bodies": list(fit.term.bodies), "parameter": _short(fit.term, p.name),
         "value": fit.fitted.values[p.name], "stderr": fit.fitted.stderr[p.name], "unit": fit.term.units[p.name],
         "std_between_bodies": fit.strength_std, "held_out_rmse_mm": fit.fitted.held_out_mm,
-        "information_gain": fit.bic_gain,
+        "log_bayes_factor": fit.log_bayes_factor,
     }  # fmt: skip
 
 
@@ -309,7 +344,7 @@ def text(document: Mapping[str, Any]) -> str:
     for c in shown["candidates"][:6]:
         lines.append(
             f"  {c['effect']:20s} explains {100 * c['explained']:3.0f} %  {c['theta']:.3g} {c['unit']}"
-            + _looks_like(c["confusable_with"])
+            + _probable(c["probability"])
         )
     lines += [f"  {c['effect']:20s} not ranked: {c['reason']}" for c in shown["not_ranked"]]
     for done in shown["rounds"]:
@@ -317,7 +352,7 @@ def text(document: Mapping[str, Any]) -> str:
         lines += [f"  refit {f['effect']} ({f['law']}): {f['reason']}" for f in done["not_fitted"]]
     for a in shown["accepted"]:
         values = ", ".join(f"{n} {v:.4g}{_plus_minus(a['stderr'][n])} {a['unit'][n]}" for n, v in a["theta"].items())
-        lines.append(f"{a['effect']}: {values}" + _looks_like(a["confusable_with"]))
+        lines.append(f"{a['effect']}: {values}" + _looks_like(a["indistinguishable_from"]))
     lines.append(
         f"before {before['fit']['trajectory_rmse_mm']:.1f} mm{_held(before['held_out'].get('trajectory_rmse_mm'))}, "
         f"after {after['fit']['trajectory_rmse_mm']:.1f} mm{_held(after['held_out'].get('trajectory_rmse_mm'))}"
@@ -329,6 +364,12 @@ def text(document: Mapping[str, Any]) -> str:
             f"{_held(force['held_out_rmse_mm'])}: it stands in for the discrepancy and explains nothing"
         )
     lines += _several_bodies(shown["bodies"], shown["shared"])
+    if shown["verdict"] != RANKED:
+        lines.append(
+            f"probability of no effect {shown['null_probability']:.2g}; a residual as large as that after has a "
+            f"probability of {shown['predictive_p']['after']:.2g} if nothing is missing"
+        )
+    lines += _limit_lines(shown["upper_limits"])
     n = shown["next_experiment"]
     if n is not None:
         lines.append(
@@ -340,9 +381,20 @@ def text(document: Mapping[str, Any]) -> str:
 
 
 def _refit_line(row: Mapping[str, Any]) -> str:
-    outcome = "accepted" if row["accepted"] else "; ".join(row["objections"]) or "another was better"
     errors = f"{row['fit_rmse_mm']:.1f} mm{_held(row['held_out_rmse_mm'])}"
-    return f"  refit {row['effect']} ({row['law']}): {errors}: {outcome}"
+    return f"  refit {row['effect']} ({row['law']}): {errors}: {outcome(row)}"
+
+
+def _limit_lines(limits: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What is excluded, and what this recording says little of."""
+    told = [f"{x['effect']} {x['strength']:.2g} {x['unit']}".strip() for x in limits if x["determined"]]
+    open_ = [x["effect"] for x in limits if not x["determined"]]
+    lines = [f"95 % upper limits: {', '.join(told)}"] if told else []
+    return [*lines, *([f"this recording says little of {', '.join(open_)}"] if open_ else [])]
+
+
+def _probable(probability: float | None) -> str:
+    return "" if probability is None else f", probability {probability:.2g}"
 
 
 def _several_bodies(bodies: Mapping[str, Any], shared: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -7,11 +7,11 @@ from typing import cast
 import numpy as np
 
 from masiv.errors import NonFiniteError
-from masiv.inference.model_fit import ModelFit, rank_by_bic
+from masiv.inference.model_fit import ModelFit
 from masiv.models.free_body import FreeBodyModel
 from masiv.progress import Progress
 from masiv.refinement.result import Proposal
-from masiv.refinement.rounds import MIN_BIC_GAP, Round, SearchResult
+from masiv.refinement.rounds import Round, SearchResult
 
 INITIAL_STATES = (
     ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((3.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0)),
@@ -70,12 +70,12 @@ def propose(search: SearchResult, progress: Progress) -> Proposal | None:
 
 
 def _rival(first: Round, best: ModelFit) -> ModelFit | None:
-    """What may be there in place of the accepted effect, or else the best other refit of its round, if the data hardly
-    distinguishes them."""
-    rivals = rank_by_bic([t.fitted for t in first.trials if t.fitted.model.effects != best.model.effects])
-    equal = [f for f in rivals if f.model.effects[-1] in first.indistinguishable_from]
-    if equal or not rivals:
-        return equal[0] if equal else None
-    rival = rivals[0]
-    similar = rival.model.effects[-1] in first.confusable.get(best.model.effects[-1], [])
-    return rival if similar or best.bic_gain(rival) < MIN_BIC_GAP else None
+    """The most probable other effect in the credible set of the round that accepted ``best``; None if there is none."""
+    assert first.posterior is not None
+    credible = first.posterior.credible_set()
+    others = [
+        (credible[h.effects], h.marginal.log_evidence, h.fitted)
+        for h in first.posterior.hypotheses
+        if h.effects in credible and len(h.effects) == len(best.model.effects) and h.effects != set(best.model.effects)
+    ]
+    return max(others, key=lambda item: item[:2])[2] if others else None

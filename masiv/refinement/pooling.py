@@ -15,7 +15,7 @@ from masiv.inference.robust import robust_scale_of
 from masiv.models.base import EffectTerm, Model
 from masiv.models.point_mass import PointMassModel
 from masiv.refinement.config import RefineConfig
-from masiv.refinement.evidence import objections_to
+from masiv.refinement.hypotheses import Posterior, linearized, weighed
 from masiv.refinement.result import BodyResult, RefineResult, SharedFit
 from masiv.refinement.rounds import SearchResult
 from masiv.refinement.search_state import SearchSettings
@@ -32,7 +32,6 @@ def refine_bodies(forward_model: PointMassModel, settings: SearchSettings) -> Re
     more = len(forward_model.bodies)  # flights cost nothing: try all that a body may have of its own
     settings = replace(
         settings, max_effects=settings.max_effects + more, shortlist=settings.shortlist + 2 * more,
-        search_second_effect=False,  # every body is looked at by itself already
     )  # fmt: skip
     result = refine(forward_model, [fit_flights(forward_model)], settings)
     pool = _Pool(forward_model.with_observations(result.observations), result.search, settings.config)
@@ -101,7 +100,13 @@ class _Pool:
             fitted = fit_flights(one, others.with_effect(own.name), values)
         except MasivError as failed:
             return (str(failed),)
-        return tuple(objections_to(one, without, fitted, own, self.config)) or fitted
+        if why := one.impossible(fitted, own):
+            return tuple(why)
+        null, effect = weighed(one, [without, fitted], [linearized(one, without), linearized(one, fitted)])
+        p = Posterior.of([null, effect], 1).with_at_most(len(others.effects))
+        if p >= self.config.max_null_probability:
+            return (f"its own flights leave a probability of {p:.2g} that it does not act",)
+        return effect.with_posterior()
 
     def by_body(self, objections: Mapping[str, tuple[str, ...]]) -> dict[str, BodyResult]:
         """Effects and held-out errors of each body."""
@@ -138,4 +143,6 @@ class _Pool:
         )  # fmt: skip
         strengths = [after.values[t.parameters[0].name] for t in parts if t.bodies]
         std = float(np.std(strengths, ddof=1)) if len(strengths) > 1 else math.nan
-        return SharedFit(one, fitted, after.bic(after.samples) - fitted.bic(after.samples), std)
+        each, shared = weighed(model, [after, fitted], [linearized(model, after), linearized(model, fitted)])
+        factor = shared.marginal.log_evidence - each.marginal.log_evidence
+        return SharedFit(one, shared.with_posterior(), factor, std)

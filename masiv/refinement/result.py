@@ -15,6 +15,7 @@ from masiv.refinement.config import RefineConfig
 from masiv.refinement.rounds import SearchResult
 
 ADDED, NOTHING, UNEXPLAINED, RANKED = "effect added", "nothing missing", "unexplained residual", "ranked only"
+CANNOT_TELL = "cannot tell"
 
 
 @dataclass(frozen=True)
@@ -45,13 +46,13 @@ class BodyResult:
 
 @dataclass(frozen=True)
 class SharedFit:
-    """An effect that several bodies have, fitted with one strength for them all. bic_gain: how much lower the
-    information criterion is than with one strength each (negative: the data asks for one each). strength_std: standard
+    """An effect that several bodies have, fitted with one strength for them all. log_bayes_factor: for
+    one strength against one strength each (negative: the data asks for one each). strength_std: standard
     deviation between the bodies with one strength each, in the strength's unit."""
 
     term: EffectTerm
     fitted: ModelFit
-    bic_gain: float
+    log_bayes_factor: float
     strength_std: float
 
 
@@ -98,13 +99,21 @@ class RefineResult:
 
     @property
     def verdict(self) -> str:
-        """ "unexplained residual" if more is left than noise and discretization explain, whether an effect was added or
-        not; else "effect added" or "nothing missing"; "ranked only" if none was fitted."""
+        """ "unexplained residual" if so large a residual is improbable with nothing missing, whether an effect was added
+        or not; else "effect added"; "nothing missing" if that is more probable than not; "cannot tell" if not, and no
+        effect is probable enough to be named; "ranked only" if none was fitted."""
         if self.ranked_only:
             return RANKED
-        if self.reduced_chi(self.after) > self.config.max_reduced_chi:
+        if self.predictive_p["after"] < self.config.min_predictive_p:
             return UNEXPLAINED
-        return ADDED if self.accepted else NOTHING
+        if self.accepted:
+            return ADDED
+        return NOTHING if self.search.null_probability > 0.5 else CANNOT_TELL
+
+    @property
+    def predictive_p(self) -> Mapping[str, float]:
+        """See ``SearchResult``; ``before`` and ``after``."""
+        return self.search.predictive_p or {"before": 1.0, "after": 1.0}
 
     @property
     def changes_twin(self) -> bool:

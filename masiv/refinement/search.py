@@ -1,4 +1,4 @@
-"""The search: rank the effects, fit the best through the rollout, accept what held-out data confirms, and again."""
+"""The search: rank the effects, fit the best through the rollout, accept what is probable, and again."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from masiv.errors import MasivError
-from masiv.inference.discretization import with_grid_errors, with_residual_std
-from masiv.inference.model_fit import ModelFit, rank_by_bic, refit_whitened
+from masiv.inference.discretization import with_residual_std
+from masiv.inference.evidence import Evidence, predictive_p
+from masiv.inference.model_fit import ModelFit, rank_by_bic, refit_whitened, warm_started_fit
 from masiv.inference.robust import robust_scale_of
 from masiv.models.base import ForwardModel
 from masiv.refinement.candidates import score
 from masiv.refinement.effect_fit import BROYDEN_STEPS, fit_with_effect
-from masiv.refinement.evidence import above_noise, select_by_validation, statistical_objections
+from masiv.refinement.hypotheses import Hypothesis, Posterior, linearized, weighed
+from masiv.refinement.limits import UpperLimit, try_sensitivity, upper_limit
 from masiv.refinement.rounds import Round, SearchResult
 from masiv.refinement.search_round import run_round
 from masiv.refinement.search_state import SearchSettings, SearchState
-from masiv.refinement.second_effect import search_second_effect
 from masiv.refinement.tasks import map_tasks
 from masiv.workers import TaskError
 
@@ -26,32 +27,36 @@ MIN_ROBUST_SCALE = 5.0
 """Robust scale of the search over the noise of the first observation, at the least."""
 WHITENING_PASSES = 2
 """How often the best law is chosen: the one that is best before ``residual_std`` is known may not be it."""
+RIVALS = 1
+"""Further models on top of which one effect more is looked for: effects take each other over."""
 
 
 def search_effects(
     forward_model: ForwardModel, baselines: Sequence[ModelFit], settings: SearchSettings
 ) -> SearchResult:
-    """Add effects to the best of ``baselines`` (one a law, without effects) until none is confirmed, or the residual is
-    near the noise. Raises MasivError if no baseline can be simulated."""
+    """Add effects to the best of ``baselines`` (one a law, without effects) as long as one more is probable. Raises
+    MasivError if no baseline can be simulated."""
     start, laws = whitened_start(forward_model, baselines, settings)
     state, rounds = _add_effects(start, laws, settings)
-    state, rounds = _reject_unexplained(start, state, rounds, settings)
+    before = rounds[0].base if rounds else start.fit
+    if settings.rank_only:
+        return SearchResult(state.forward_model, before, before, tuple(rounds))
+    null = rounds[0].posterior.with_at_most(0) if rounds and rounds[0].posterior else 1.0
+    after = state.fit if state.fit.model.effects else before
+    checked = {"before": _predictive_p(start, before), "after": _predictive_p(state, after)}
     discrepancy = None
-    wanted = settings.discrepancy_force and not settings.rank_only
-    if wanted and state.reduced_chi > settings.config.max_reduced_chi:
-        discrepancy = discrepancy_force(state, settings)
-    after = with_grid_errors(state.forward_model.observations, state.fit, state.robust_scale)
-    before = after if state.fit is start.fit else start.fit
-    return SearchResult(state.forward_model, before, after, tuple(rounds), discrepancy)
+    if settings.discrepancy_force and checked["after"] < settings.config.min_predictive_p:
+        discrepancy = discrepancy_force(state.with_fit(after), settings)
+    limits = _upper_limits(state.with_fit(after), rounds, settings)
+    return SearchResult(state.forward_model, before, after, tuple(rounds), null, checked, tuple(limits), discrepancy)
 
 
 def whitened_start(
     forward_model: ForwardModel, baselines: Sequence[ModelFit], settings: SearchSettings
 ) -> tuple[SearchState, list[ModelFit]]:
     """The best of ``baselines``, and all of them that compete, best first, fitted again with ``residual_std`` as the
-    best of them moves. That one is the simplest that predicts the motion, since a law that takes an effect over in the
-    fitted instants is exposed by the others; the rest are in the order of the information criterion."""
-    observation_std = [e.residual_std for e in forward_model.observations]
+    best of them moves. The order is that of the information criterion; evidence decides in the rounds."""
+    observation_std = [e.observation_std for e in forward_model.observations]
     first = min(baselines, key=lambda f: f.cost)
     state, laws = SearchState(forward_model, first, observation_std, 0.0), [first]
     for _ in range(WHITENING_PASSES):
@@ -66,11 +71,9 @@ def whitened_start(
         settings.progress("refine: fit whitened residuals", 1, 1, "")
         laws = again[: settings.config.families]
         state = replace(state, forward_model=whitened, robust_scale=scale)
-        best = select_by_validation(laws, state.noise)
-        laws.sort(key=lambda f, best=best: f is not best)
-        if best.model == first.model:
+        if laws[0].model == first.model:
             break
-        first = best
+        first = laws[0]
     return state.with_fit(laws[0]), laws
 
 
@@ -91,50 +94,63 @@ def _add_effects(
     state: SearchState, laws: Sequence[ModelFit], settings: SearchSettings
 ) -> tuple[SearchState, list[Round]]:
     rounds: list[Round] = []
-    config = settings.config
-    bases = laws
-    while len(rounds) < settings.max_effects and (settings.rank_only or above_noise(state.fit, state.noise, config)):
+    bases = list(laws)
+    while len(rounds) < settings.max_effects:
         done = run_round(state, bases, settings)
         rounds.append(done)
         if done.accepted is None:
+            # Standard errors are those of the posterior; the model is the one that the last round confirmed.
             return state.with_fit(done.base), rounds
-        state = state.with_fit(done.accepted.fitted)
-        look = settings.search_second_effect and len(rounds) < settings.max_effects
-        if state.reduced_chi < config.max_reduced_chi and not look:
-            break
-        state = state.whitened_again()
-        bases = [state.fit]
-        if state.reduced_chi < config.max_reduced_chi:
-            if look:
-                second = search_second_effect(state, done, settings)
-                return state.with_fit(second.fit), [*rounds[:-1], second.first, *second.rounds]
-            break
+        state = state.with_fit(done.accepted.fitted).whitened_again()
+        bases = [state.fit, *_rivals(state, done)]
     return state, rounds
 
 
-def _reject_unexplained(
-    start: SearchState, state: SearchState, rounds: Sequence[Round], settings: SearchSettings
-) -> tuple[SearchState, list[Round]]:
-    """``start`` if what was accepted leaves much unexplained and less than half of the residual is gone: what it does
-    not explain gets no name. The noise model is then that of ``start``, too."""
-    if state.fit is start.fit:
-        return state, list(rounds)
-    left, there_was = state.reduced_chi, state.noise.reduced_chi(start.fit.squares)
-    if left <= max(settings.config.max_reduced_chi, there_was / 2):
-        return state, list(rounds)
-    why = f"it leaves a residual of {left:.1f} times what noise and discretization explain"
-    return start, [_rejected(r, why) for r in rounds]
+def _rivals(state: SearchState, done: Round) -> list[ModelFit]:
+    """What may act in place of what was accepted, with the same law."""
+    assert done.accepted is not None and done.posterior is not None
+    here = done.accepted.fitted.model
+    out = []
+    for h in done.posterior.hypotheses:
+        other = len(h.effects) == len(here.effects) and h.effects != frozenset(here.effects)
+        if other and h.law == here.family.kind and h.effects in done.posterior.credible_set():
+            try:
+                out.append(warm_started_fit(state.forward_model, h.fitted, state.robust_scale))
+            except MasivError:
+                continue
+    return out[:RIVALS]
 
 
-def _rejected(done: Round, why: str) -> Round:
-    if done.accepted is None:
-        return done
-    trials = [replace(t, objections=(*t.objections, why)) if t is done.accepted else t for t in done.trials]
-    return replace(done, trials=tuple(trials), accepted=None, indistinguishable_from=())
+def _predictive_p(state: SearchState, fitted: ModelFit) -> float:
+    line = linearized(state.forward_model, fitted)
+    terms = [state.forward_model.term(n) for n in fitted.model.effects]
+    return predictive_p(Evidence.of(state.forward_model.observations, line.fields), line, terms)
+
+
+def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchSettings) -> list[UpperLimit]:
+    """Of all effects that could act in addition to ``state.fit``, at the places where the first ranking saw them."""
+    model, fitted = state.forward_model, state.fit
+    names = settings.considered(model, fitted.model)
+    places = {c.effect: c.theta for c in rounds[0].candidates} if rounds else {}
+    line = linearized(model, fitted)
+    terms = [model.term(n) for n in fitted.model.effects]
+    evidence = Evidence.of(model.observations, line.fields)
+    here = evidence.marginal(line, terms).log_evidence
+    label = "refine: upper limits"
+    settings.progress(label, 0, len(names))
+    out = []
+    tasks = [(line, name, places.get(name, {})) for name in names]
+    for done, (name, found) in enumerate(
+        zip(names, map_tasks(settings.workers, model, try_sensitivity, tasks), strict=True)
+    ):
+        settings.progress(label, done + 1, len(names), name)
+        if found is not None and not isinstance(found, TaskError):
+            out.append(upper_limit(evidence, line, terms, model.term(name), here, found))
+    return out
 
 
 def discrepancy_force(state: SearchState, settings: SearchSettings) -> ModelFit | None:
-    """``state.fit`` with a smooth force for what is not known; None if held-out data does not confirm it."""
+    """``state.fit`` with a smooth force for what is not known; None if it is not probable either."""
     label = "refine: a smooth force for the rest"
     model = state.forward_model
     ranking = score(
@@ -145,10 +161,12 @@ def discrepancy_force(state: SearchState, settings: SearchSettings) -> ModelFit 
         return None
     try:
         fitted = fit_with_effect(model, state.fit, ranking.candidates[0], state.robust_scale)
+        hypotheses: list[Hypothesis] = weighed(
+            model, [state.fit, fitted], [linearized(model, state.fit), linearized(model, fitted)]
+        )
     except MasivError as failed:
         settings.progress(label, 1, 1, str(failed))
         return None
     settings.progress(label, 1, 1, f"{fitted.fit_mm:.1f} mm")
-    term = model.term(DISCREPANCY_FORCE)
-    objections = statistical_objections(state.fit, fitted, term, state.noise, settings.config)
-    return None if objections else fitted
+    without = Posterior.of(hypotheses, 1).with_at_most(len(state.fit.model.effects))
+    return hypotheses[1].with_posterior() if without < settings.config.max_null_probability else None

@@ -1,4 +1,4 @@
-"""One pass of the search: rank the effects, fit the best through the rollout, select one."""
+"""One pass of the search: rank the effects, fit the best through the rollout, weigh them against each other."""
 
 from __future__ import annotations
 
@@ -6,23 +6,22 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
+from masiv.effects.catalogue import effect_named
 from masiv.errors import MasivError
 from masiv.inference.model_fit import (
     ModelFit,
-    common_samples,
     gauss_newton_fit,
     held_parameters,
     linear_strengths,
     rank_by_bic,
     warm_started_fit,
 )
-from masiv.models.base import ForwardModel
+from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.candidates import Candidate, Ranking
-from masiv.refinement.effect_fit import fit_with_effect
-from masiv.refinement.evidence import objections_to
-from masiv.refinement.rounds import MIN_BIC_GAP, Failure, Round, Trial, confusable, rank_trials
+from masiv.refinement.effect_fit import MIN_PROMISE_KEPT, fit_with_effect
+from masiv.refinement.hypotheses import Hypothesis, Posterior, linearized, weighed
+from masiv.refinement.rounds import Failure, Round, Trial, rank_trials
 from masiv.refinement.search_state import SearchSettings, SearchState
-from masiv.refinement.selection import Selection, select
 from masiv.refinement.tasks import map_tasks, rank
 from masiv.workers import TaskError
 
@@ -30,6 +29,8 @@ FALSE_MINIMUM_RATIO = 0.5
 """A model with one more effect that has less than this part of its base's cost may have got out of a false minimum."""
 MAX_PROMISE_ERROR = 1.5
 """Factor by which a ranking, which is linear, may have underestimated an effect."""
+WIDER_REDUCED_CHI = 1.2
+"""Residual of the best trial over its standard deviation above which twice as many effects are fitted."""
 
 
 def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSettings) -> Round:
@@ -42,17 +43,13 @@ def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSet
         if current.model.effects:
             current = _restart_base(state, trials[0].fitted)
     ranking = _with_inapplicable(state, attempts.ranking, settings)
-    alike = confusable(ranking, trials, settings.config.confusable_correlation)
-    trials = _judge(state.with_fit(current), trials, settings)
-    selection = select(trials, state.noise, settings.config)
-    if selection.trial is not None:
-        final = _completed(state.with_fit(current), selection.trial, settings)
-        trials = [final if t is selection.trial else t for t in trials]
-        selection = Selection(final, selection.indistinguishable_from) if final.passes else Selection()
-    return Round(
-        current, ranking, tuple(trials), selection.trial, alike, selection.indistinguishable_from,
-        attempts.failures,
-    )  # fmt: skip
+    if settings.rank_only:
+        return Round(current, ranking, (), None, failures=attempts.failures)
+    trials = [
+        replace(t, impossible=tuple(reasons_against(state.forward_model, t)), converged=_converged(t, bases))
+        for t in trials
+    ]
+    return _judged(state.with_fit(current), bases, trials, replace(attempts, ranking=ranking), settings)
 
 
 # -- ranking and fitting ---------------------------------------------------------------------------------------------
@@ -91,7 +88,7 @@ def _try_effects(state: SearchState, bases: Sequence[ModelFit], settings: Search
             c for c in candidates[: settings.shortlist] if start.curriculum or could_improve(c, base, out.trials)
         ]
         out = out.with_fits(_fitted_trials(start, shortlist, settings))
-        if first and _needs_wider_shortlist(state, out.trials, settings):
+        if first and _needs_wider_shortlist(state, out.trials):
             # The ranking is linear: an effect that acts at a place may be far down in it.
             wider = candidates[settings.shortlist : 2 * settings.shortlist]
             out = out.with_fits(_fitted_trials(start, wider, settings))
@@ -182,12 +179,12 @@ def _fit_through_curriculum(
     return fitted
 
 
-def _needs_wider_shortlist(state: SearchState, trials: Sequence[Trial], settings: SearchSettings) -> bool:
+def _needs_wider_shortlist(state: SearchState, trials: Sequence[Trial]) -> bool:
     """Whether the best of ``trials`` leaves more than noise and discretization explain."""
     if not trials:
         return False
     best = min((t.fitted for t in trials), key=lambda f: f.cost)
-    return state.noise.reduced_chi(best.squares) > settings.config.noise_threshold
+    return state.noise.reduced_chi(best.squares) > WIDER_REDUCED_CHI
 
 
 def could_improve(candidate: Candidate, base: ModelFit, trials: Sequence[Trial]) -> bool:
@@ -261,44 +258,84 @@ def _restart_base(state: SearchState, best: ModelFit) -> ModelFit:
 # -- judgement -------------------------------------------------------------------------------------------------------
 
 
-def _judge(state: SearchState, trials: Sequence[Trial], settings: SearchSettings) -> list[Trial]:
-    """``trials``, best first, with the objections to each."""
-    with_objections = [replace(t, objections=tuple(_objections(state, t.fitted, t, settings))) for t in trials]
-    more = {id(t): dominated_by(state, t, with_objections, settings) for t in with_objections if t.passes}
-    return [replace(t, objections=(*t.objections, *more.get(id(t), ()))) for t in with_objections]
+def reasons_against(forward_model: ForwardModel, trial: Trial) -> list[str]:
+    """Why the effect of ``trial`` cannot act as it was fitted; empty if it can."""
+    term = forward_model.term(trial.effect)
+    return [*forward_model.impossible(trial.fitted, term), *parameters_at_bounds(trial.fitted, term)]
 
 
-def _objections(state: SearchState, fitted: ModelFit, trial: Trial, settings: SearchSettings) -> list[str]:
-    term = state.forward_model.term(trial.effect)
-    return objections_to(state.forward_model, state.fit, fitted, term, settings.config)
+def parameters_at_bounds(fitted: ModelFit, term: EffectTerm) -> list[str]:
+    """Which parameters of ``term`` ran into the bound of what is possible."""
+    # What acts on the matter at a place may well be at the body's face, where its place ends.
+    bounded = term.strengths if effect_named(term.effect).hints.inside else term.parameters
+    return [
+        f"{p.name} runs into the bound of what is possible, {p.upper:g}"
+        for p in bounded
+        if fitted.values[p.name] >= p.upper - 1e-9 * abs(p.upper)
+    ]
 
 
-def dominated_by(state: SearchState, trial: Trial, trials: Sequence[Trial], settings: SearchSettings) -> list[str]:
-    """Why ``trial``, which passes, must not be named: an effect that is no richer explains more, and is not certain.
-    (One that physics forbids does not count.)"""
-    model = state.forward_model
-    samples = common_samples([t.fitted for t in trials])
-    for other in trials:
-        if (
-            not other.passes
-            and other.effect != trial.effect
-            and len(other.fitted.parameters) <= len(trial.fitted.parameters)
-            and other.fitted.bic(samples) < trial.fitted.bic(samples) - MIN_BIC_GAP
-            and not model.objections(state.fit, other.fitted, model.term(other.effect), settings.config.min_gain)
-        ):
-            return [f"{other.effect} explains more with no more parameters, and is not certain"]
-    return []
+def _converged(trial: Trial, bases: Sequence[ModelFit]) -> bool:
+    """Whether the fit explains what the ranking promised, but for half of it. The base is the best one of its law."""
+    same = [b for b in bases if b.model.family.kind == trial.law] or list(bases)
+    base = min(b.cost for b in same)
+    return base - trial.fitted.cost >= MIN_PROMISE_KEPT * trial.candidate.explained * base
+
+
+def _judged(
+    state: SearchState, bases: Sequence[ModelFit], trials: Sequence[Trial], attempts: _Attempts,
+    settings: SearchSettings,
+) -> Round:  # fmt: skip
+    """The round with the posterior over the models without (``bases``) and with one effect more (``trials``)."""
+    without = [state.fit, *bases[1:]]
+    possible = [t for t in trials if not t.impossible]
+    hypotheses = _weighed(state, [*without, *(t.fitted for t in possible)], settings)
+    least = max(
+        (h.marginal.log_evidence for h in hypotheses if len(h.effects) == len(state.fit.model.effects)), default=0.0
+    )
+    known = {id(h.fitted): h.marginal.log_evidence - least for h in hypotheses}
+    trials = [replace(t, log_bayes_factor=known.get(id(t.fitted))) for t in trials]
+    trials.sort(key=lambda t: -math.inf if t.log_bayes_factor is None else t.log_bayes_factor, reverse=True)
+    count = len(settings.considered(state.forward_model, state.fit.model)) + len(state.fit.model.effects)
+    posterior = Posterior.of(hypotheses, count)
+    fewer = len(state.fit.model.effects)
+    chosen = posterior.best(fewer + 1)
+    accepted = None
+    if chosen is not None and posterior.with_at_most(fewer) < settings.config.max_null_probability:
+        trial = next(t for t in trials if t.fitted is chosen.fitted)
+        final = _completed(state, trial, settings)
+        trials = [final if t is trial else t for t in trials]
+        accepted = final if not final.impossible else None
+    current = posterior.best(fewer)
+    base = current.with_posterior() if current is not None else state.fit
+    return Round(base, attempts.ranking, tuple(trials), accepted, posterior, attempts.failures)
+
+
+def _weighed(state: SearchState, fits: Sequence[ModelFit], settings: SearchSettings) -> list[Hypothesis]:
+    """Those of ``fits`` that have derivatives over all instants, with their evidence."""
+    label = "refine: weigh models"
+    settings.progress(label, 0, len(fits))
+    kept, lines = [], []
+    results = map_tasks(settings.workers, state.forward_model, linearized, [(f,) for f in fits])
+    for done, (fit, line) in enumerate(zip(fits, results, strict=True)):
+        settings.progress(label, done + 1, len(fits))
+        if not isinstance(line, TaskError):
+            kept.append(fit)
+            lines.append(line)
+    return weighed(state.forward_model, kept, lines) if kept else []
 
 
 def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Trial:
-    """``trial`` fitted to the end, its places free if that pays, and its objections again."""
+    """``trial`` fitted to the end, its places free if that pays, with the standard errors of its posterior."""
     model, start = state.forward_model, trial.fitted
     final = gauss_newton_fit(
         model, start.model, start.values, budget=2 * len(start.parameters) + 6, robust_scale=state.robust_scale,
         held=held_parameters(model, start),
     )  # fmt: skip
     best = _with_free_places(state, min(final, start, key=lambda f: f.cost))
-    return replace(trial, fitted=best, objections=tuple(_objections(state, best, trial, settings)))
+    [hypothesis] = _weighed(state, [best], settings) or [None]
+    done = replace(trial, fitted=hypothesis.with_posterior() if hypothesis else best)
+    return replace(done, impossible=tuple(reasons_against(model, done)))
 
 
 def _with_free_places(state: SearchState, fitted: ModelFit) -> ModelFit:

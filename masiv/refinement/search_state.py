@@ -18,14 +18,12 @@ from masiv.workers import Workers
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """config: thresholds; max_effects, shortlist, search_second_effect: see ``RefineConfig``, whose values they have
-    unless given. rank_only: rank the effects, fit none. discrepancy_force: if much stays unexplained, fit a smooth
+    """config: see ``RefineConfig``; max_effects, shortlist: its values unless given. rank_only: rank the effects, fit none. discrepancy_force: if much stays unexplained, fit a smooth
     force for it."""
 
     config: RefineConfig
     max_effects: int
     shortlist: int
-    search_second_effect: bool
     rank_only: bool = False
     discrepancy_force: bool = True
     workers: Workers = field(default_factory=Workers)
@@ -38,7 +36,7 @@ class SearchSettings:
     ) -> SearchSettings:  # fmt: skip
         """As ``config`` has them."""
         return cls(
-            config, config.max_effects, config.shortlist, config.search_second_effect, rank_only, discrepancy_force,
+            config, config.max_effects, config.shortlist, rank_only, discrepancy_force,
             workers or Workers(), progress,
         )  # fmt: skip
 

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from masiv.errors import InputError
-from masiv.refinement.answer import answer, words
+from masiv.refinement.answer import answer, outcome, words
 from masiv.report import plots
 from masiv.report.page import Page, Share, number
 
@@ -37,7 +37,7 @@ def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | No
             fields = {name: file[f"{name}@{first}"] for name in ("before", "after", "points", "times", "fit_count")}
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise InputError(f"{run / REFINED} and {FIELDS} cannot be read ({error}): run masiv refine again") from error
-    if not isinstance(document, dict) or document.get("schema") != 2:
+    if not isinstance(document, dict) or document.get("schema") != 3:
         raise InputError(f"{run / REFINED} is of another version of masiv: run masiv refine again")
     return document, fields
 
@@ -56,6 +56,7 @@ def refinement_section(
     if fields is not None:
         _figures(page, document, fields, up)
     _causes(page, document["candidates"])
+    _limits(page, document["upper_limits"])
     _refits(page, document["rounds"])
     _before_after(page, document["before"], document["after"])
     _accepted(page, document["accepted"])
@@ -90,7 +91,15 @@ def _verdict(document: Mapping[str, Any]) -> str:
     return (
         f"Verdict: {answer(document)}. Residual (simulated less observed) on "
         f"{', on '.join(errors)}; noise floor of the observation {number(document['noise_floor_mm'])} mm. "
+        f"{_probabilities(document)}"
         f"Classical law with its best parameters: {law}. {document['rollouts']} rollouts.{_grid(document)}"
+    )
+
+
+def _probabilities(document: Mapping[str, Any]) -> str:
+    p, check = document["null_probability"], document["predictive_p"]["after"]
+    return (
+        f"Probability that no effect acts: {number(p)}; of so large a residual with nothing missing: {number(check)}. "
     )
 
 
@@ -133,7 +142,7 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
         page.note("None was looked for: the residual is too near the noise floor.")
         return
     page.table(
-        ["effect", "explains alone", "strength", "unit", "standard error", "looks like", "what it does in a video"],
+        ["effect", "explains alone", "strength", "unit", "standard error", "probability", "what it does in a video"],
         [
             [
                 _name(c),
@@ -141,7 +150,7 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
                 _number(c["theta"]),
                 _unit(c["unit"]),
                 _number(c["stderr"]),
-                ", ".join(map(words, c["confusable_with"])) or None,
+                _number(c["probability"]),
                 c["looks_like"],
             ]
             for c in candidates
@@ -149,8 +158,30 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
     )
     page.note(
         "Share of the residual that one effect explains, after initial velocity, stiffness and ground have absorbed "
-        "what they can (score test, first order: a shortlist, the refits decide). Looks like: effects that this motion "
-        "hardly distinguishes from it."
+        "what they can (score test, first order: a shortlist, the refits decide). Probability: of the model with it, after "
+        "the refits; a dash if it was not fitted."
+    )
+
+
+def _limits(page: Page, limits: Sequence[Mapping[str, Any]]) -> None:
+    if not limits:
+        return
+    page.subheading("What is excluded")
+    page.table(
+        ["effect", "95 % upper limit", "unit", "motion at the limit [mm]", "this recording can tell"],
+        [
+            [
+                _name(x),
+                _number(x["strength"]),
+                _unit(x["unit"]),
+                _number(x["motion_mm"]),
+                "yes" if x["determined"] else "no",
+            ]
+            for x in sorted(limits, key=lambda x: not x["determined"])
+        ],
+    )
+    page.note(
+        "An effect that is not named is weaker than its limit, with 95 % probability. The limit is of a linear model."
     )
 
 
@@ -159,11 +190,10 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
     for turn, done in enumerate(rounds, start=1):
         for refit in done["refits"]:
             values = ", ".join(f"{words(n)} {number(_number(q['value']))}" for n, q in refit["parameters"].items())
-            result = "accepted" if refit["accepted"] else "; ".join(refit["objections"]) or "another was better"
             rows.append([
                 turn, ", ".join(map(words, [*done["base"]["effects"], _name(refit)])), words(refit["law"]),
                 _number(refit["fit_rmse_mm"]), _number(refit["held_out_rmse_mm"]),
-                _number(refit["information_gain"]), values, result,
+                _number(refit["log_bayes_factor"]), values, outcome(refit),
             ])  # fmt: skip
     if not rows:
         return
@@ -175,9 +205,9 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
             "law",
             "fitted [mm]",
             "held out [mm]",
-            "BIC falls by",
+            "log Bayes factor",
             "values",
-            "accepted, or objections",
+            "outcome",
         ],
         rows,
     )
@@ -209,7 +239,7 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
         return
     page.subheading("What was added")
     page.table(
-        ["effect", "parameter", "value", "standard error", "unit", "indistinguishable from", "looks like"],
+        ["effect", "parameter", "value", "standard error", "unit", "may be in its place"],
         [
             [
                 _name(a),
@@ -218,7 +248,6 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
                 _number(a["stderr"].get(n)),
                 _unit(a["unit"].get(n, "")),
                 ", ".join(map(words, a.get("indistinguishable_from", []))) or None,
-                ", ".join(map(words, a.get("confusable_with", []))),
             ]
             for a in accepted
             for n, value in a["theta"].items()

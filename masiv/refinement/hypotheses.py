@@ -1,0 +1,123 @@
+"""Which effects act: the posterior over models with none, one or several, and what follows from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from masiv.inference.evidence import Evidence
+from masiv.inference.linear_model import LinearModel, linear_model
+from masiv.inference.marginal_likelihood import Marginal
+from masiv.inference.model_fit import ModelFit
+from masiv.models.base import ForwardModel
+
+CREDIBLE = 0.95
+"""Probability of the smallest set of answers that is reported."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A law with effects, fitted, and linearised about the fit over all instants. marginal: its evidence."""
+
+    fitted: ModelFit
+    linear: LinearModel
+    marginal: Marginal
+
+    @property
+    def effects(self) -> frozenset[str]:
+        return frozenset(self.fitted.model.effects)
+
+    @property
+    def law(self) -> str:
+        return self.fitted.model.family.kind
+
+    def with_posterior(self) -> ModelFit:
+        """The fit with the standard errors of the posterior, errors of law, initial state and noise included."""
+        names = [p.name for p in self.linear.parameters]
+        spread = np.sqrt(np.diag(self.marginal.covariance))[: len(names)]
+        errors = {
+            p.name: float(s) * (abs(self.fitted.values[p.name]) if p.log else 1.0)
+            for p, s in zip(self.linear.parameters, spread, strict=True)
+        }
+        return replace(self.fitted, stderr={**self.fitted.stderr, **errors})
+
+
+def linearized(forward_model: ForwardModel, fitted: ModelFit) -> LinearModel:
+    """``fitted`` with derivatives by all parameters of its model, places that were held at a guess included. Raises
+    NonFiniteError."""
+    parameters = [p for p in forward_model.parameters(fitted.model) if p.name in fitted.values]
+    return linear_model(forward_model, fitted.model, fitted.values, parameters)
+
+
+def weighed(forward_model: ForwardModel, fits: Sequence[ModelFit], linear: Sequence[LinearModel]) -> list[Hypothesis]:
+    """Hypotheses of ``fits``, with one expectation of errors: what the best of them leaves."""
+    best = min(range(len(fits)), key=lambda k: fits[k].cost)
+    evidence = Evidence.of(forward_model.observations, linear[best].fields)
+    return [
+        Hypothesis(fit, line, evidence.marginal(line, [forward_model.term(n) for n in fit.model.effects]))
+        for fit, line in zip(fits, linear, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Probabilities of ``hypotheses``. Sets of as many effects are equally likely beforehand, and one effect more is half
+    as likely in all (Scott & Berger 2010); so are laws.
+
+    candidates: effects that could act, of which the sets are drawn.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    probabilities: tuple[float, ...]
+
+    @classmethod
+    def of(cls, hypotheses: Sequence[Hypothesis], candidates: int) -> Posterior:
+        best: dict[tuple[frozenset[str], str], Hypothesis] = {}
+        for h in hypotheses:
+            key = (h.effects, h.law)
+            if key not in best or h.marginal.log_evidence > best[key].marginal.log_evidence:
+                best[key] = h
+        kept = tuple(best.values())
+        logs = np.array([h.marginal.log_evidence + log_prior(len(h.effects), candidates) for h in kept])
+        shares = np.exp(logs - logs.max())
+        return cls(kept, tuple(float(p) for p in shares / shares.sum()))
+
+    def with_at_most(self, count: int) -> float:
+        """Probability that no more than ``count`` effects act."""
+        return sum(p for h, p in zip(self.hypotheses, self.probabilities, strict=True) if len(h.effects) <= count)
+
+    def sets(self) -> dict[frozenset[str], float]:
+        """Probability of each set of effects, over the laws; most probable first."""
+        out: dict[frozenset[str], float] = {}
+        for h, p in zip(self.hypotheses, self.probabilities, strict=True):
+            out[h.effects] = out.get(h.effects, 0.0) + p
+        return dict(sorted(out.items(), key=lambda item: -item[1]))
+
+    def probability(self, fitted: ModelFit) -> float:
+        """Of the effects of ``fitted``, over the laws."""
+        return self.sets().get(frozenset(fitted.model.effects), 0.0)
+
+    def best(self, count: int) -> Hypothesis | None:
+        """The most probable set of ``count`` effects, with its most probable law."""
+        chosen = next((s for s in self.sets() if len(s) == count), None)
+        if chosen is None:
+            return None
+        own = [h for h in self.hypotheses if h.effects == chosen]
+        return max(own, key=lambda h: h.marginal.log_evidence)
+
+    def credible_set(self) -> dict[frozenset[str], float]:
+        """The fewest sets of effects that have a probability of ``CREDIBLE`` together."""
+        out: dict[frozenset[str], float] = {}
+        for effects, p in self.sets().items():
+            out[effects] = p
+            if sum(out.values()) >= CREDIBLE:
+                break
+        return out
+
+
+def log_prior(effects: int, candidates: int) -> float:
+    """Logarithm of the prior of one set of ``effects``, of as many ``candidates``."""
+    return -(effects + 1) * math.log(2) - math.log(math.comb(max(candidates, effects), effects))

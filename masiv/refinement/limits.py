@@ -1,0 +1,88 @@
+"""Upper limits of effects that were not accepted: how strong they may be without having been seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from masiv.errors import NonFiniteError
+from masiv.inference.evidence import Evidence, strength_scales
+from masiv.inference.linear_model import LinearModel, linear_model
+from masiv.models.base import EffectTerm, ForwardModel
+from masiv.refinement.effect_fit import absent
+
+LEVEL = 0.95
+"""Probability that a strength is below its limit."""
+DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class UpperLimit:
+    """strength: 95 % upper limit of the size of an effect's strength, in its unit. motion_mm: root mean square change of
+    the observed motion that it makes at that limit. determined: whether the limit is below the middle of the sizes that
+    are likely beforehand: if not, the recording says little of the effect. log_bayes_factor: for the effect, linear."""
+
+    effect: str
+    strength: float
+    motion_mm: float
+    determined: bool
+    log_bayes_factor: float
+
+
+def sensitivity(
+    forward_model: ForwardModel, at: LinearModel, name: str, places: dict[str, float]
+) -> tuple[dict[str, float], LinearModel]:
+    """Values of the model ``at`` with the effect absent, and its derivatives by the effect's strengths. Raises
+    NonFiniteError."""
+    term = forward_model.term(name)
+    values = {**absent(term, at.values), **{p.name: places.get(p.name, p.start) for p in term.others}}
+    return values, linear_model(forward_model, at.model.with_effect(name), values, term.strengths)
+
+
+def upper_limit(
+    evidence: Evidence, at: LinearModel, terms: Sequence[EffectTerm], term: EffectTerm, log_evidence: float,
+    found: tuple[dict[str, float], LinearModel],
+) -> UpperLimit:  # fmt: skip
+    """The limit of ``term`` in addition to the model ``at``, which has the effects ``terms`` and ``log_evidence``."""
+    values, columns = found
+    joined = at.with_parameters(columns.model, values, columns)
+    kept = [k for k, p in enumerate(joined.parameters) if p.name not in term.replaces_parameter]
+    joined = replace(
+        joined,
+        parameters=tuple(joined.parameters[k] for k in kept),
+        jacobians=[j[..., kept] for j in joined.jacobians],
+    )
+    whole = evidence.marginal(joined, [*terms, term])
+    priors = evidence.priors(joined, [*terms, term])
+    names = [p.name for p in joined.parameters]
+    index = [names.index(p.name) for p in term.strengths]
+    # Of the widest prior of the strength: the limit is what the data say.
+    wide = evidence.marginal_with(joined, replace(priors, precision=priors.precision[-1:]))
+    mean, covariance = wide.mean[index], wide.covariance[np.ix_(index, index)]
+    draws = np.random.default_rng(0).multivariate_normal(mean, covariance, DRAWS, method="eigh")
+    lower = np.array([p.lower for p in term.strengths])
+    draws = draws[(draws >= lower).all(1)] if ((draws >= lower).all(1)).any() else np.abs(draws)
+    size = float(np.quantile(np.linalg.norm(draws, axis=1), LEVEL))
+    moved = sum(float((j**2).sum((2, 3)).sum()) for j in columns.jacobians) if len(index) == 1 else None
+    count = sum(f.shape[0] * f.shape[1] for f in columns.fields)
+    if moved is None:
+        gram = sum(np.einsum("tnai,tnaj->ij", j, j) for j in columns.jacobians)
+        squares = np.einsum("di,ij,dj->d", draws, gram, draws)
+        motion = math.sqrt(float(np.quantile(squares, LEVEL)) / count)
+    else:
+        motion = size * math.sqrt(moved / count)
+    middle = math.sqrt(sum(float(np.median(strength_scales(p))) ** 2 for p in term.strengths))
+    return UpperLimit(term.name, size, 1e3 * motion, size < middle, whole.log_evidence - log_evidence)
+
+
+def try_sensitivity(
+    forward_model: ForwardModel, at: LinearModel, name: str, places: dict[str, float]
+) -> tuple[dict[str, float], LinearModel] | None:
+    """``sensitivity``, None if the simulation diverges."""
+    try:
+        return sensitivity(forward_model, at, name, places)
+    except NonFiniteError:
+        return None
