@@ -293,8 +293,11 @@ class ClampedBodyModel(ForwardModel):
         return rms_mm(fitted) >= PHASE_LOST * rms_mm(swing)
 
     def impossible(self, fitted: FittedModel, term: EffectTerm) -> list[str]:
-        """What the medium cannot do."""
+        """What the medium cannot do, and whether the runs are too short to tell the effect from others."""
         theta = torch.tensor([fitted.values[p.name] for p in term.parameters], dtype=torch.float64)
         per_body = effect_named(term.effect).per_body
         why = per_body.violates_bounds(theta, self.drag_body) if per_body else None
-        return [] if why is None else [why]
+        duration = max(float(run.times[-1]) for run in self.observations if run.fitted)
+        places = torch.cat([torch.as_tensor(run.points, dtype=torch.float64) for run in self.observations])
+        reason = effect_named(term.effect).hints.identifiability_issue(theta, duration, places)
+        return [text for text in (why, reason) if text is not None]

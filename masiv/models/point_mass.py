@@ -234,8 +234,13 @@ class PointMassModel(ForwardModel):
         return {body: rms_mm(found) for body, found in own.items()}
 
     def impossible(self, fitted: FittedModel, term: EffectTerm) -> list[str]:
-        """What the medium cannot do to a body."""
-        return [f"{b}: {why}" for b in term.bodies or self.bodies if (why := self._forbidden(fitted, term, b))]
+        """What the medium cannot do to a body, and whether the flights are too short to tell the effect from others."""
+        out = [f"{b}: {why}" for b in term.bodies or self.bodies if (why := self._forbidden(fitted, term, b))]
+        body = (term.bodies or self.bodies)[0]
+        theta = torch.tensor([fitted.values[p.name] for p in self.parameters_of(term, body)], dtype=torch.float64)
+        duration = max(float(run.times[-1]) for run in self.observations if run.fitted)
+        reason = effect_named(term.effect).hints.identifiability_issue(theta, duration, torch.zeros(0, 3))
+        return out if reason is None else [*out, reason]
 
     def _forbidden(self, fitted: FittedModel, term: EffectTerm, body: str) -> str | None:
         """What the medium cannot do to ``body``."""

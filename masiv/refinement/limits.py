@@ -58,23 +58,23 @@ def upper_limit(
     whole = evidence.marginal(joined, [*terms, term])
     priors = evidence.priors(joined, [*terms, term])
     names = [p.name for p in joined.parameters]
-    index = [names.index(p.name) for p in term.strengths]
+    # Along axes that were not measured nothing is seen.
+    seen = [k for k in range(len(term.strengths)) if any(j[..., k].any() for j in columns.jacobians)]
+    if not seen:
+        return UpperLimit(term.name, math.inf, 0.0, False, 0.0)
+    index = [names.index(term.strengths[k].name) for k in seen]
     # Of the widest prior of the strength: the limit is what the data say.
     wide = evidence.marginal_with(joined, replace(priors, precision=priors.precision[-1:]))
     mean, covariance = wide.mean[index], wide.covariance[np.ix_(index, index)]
     draws = np.random.default_rng(0).multivariate_normal(mean, covariance, DRAWS, method="eigh")
-    lower = np.array([p.lower for p in term.strengths])
-    draws = draws[(draws >= lower).all(1)] if ((draws >= lower).all(1)).any() else np.abs(draws)
+    possible = (draws >= np.array([term.strengths[k].lower for k in seen])).all(1)
+    draws = draws[possible] if possible.any() else np.abs(draws)
     size = float(np.quantile(np.linalg.norm(draws, axis=1), LEVEL))
-    moved = sum(float((j**2).sum((2, 3)).sum()) for j in columns.jacobians) if len(index) == 1 else None
+    gram = sum(np.einsum("tnai,tnaj->ij", j[..., seen], j[..., seen]) for j in columns.jacobians)
+    squares = np.einsum("di,ij,dj->d", draws, gram, draws)
     count = sum(f.shape[0] * f.shape[1] for f in columns.fields)
-    if moved is None:
-        gram = sum(np.einsum("tnai,tnaj->ij", j, j) for j in columns.jacobians)
-        squares = np.einsum("di,ij,dj->d", draws, gram, draws)
-        motion = math.sqrt(float(np.quantile(squares, LEVEL)) / count)
-    else:
-        motion = size * math.sqrt(moved / count)
-    middle = math.sqrt(sum(float(np.median(strength_scales(p))) ** 2 for p in term.strengths))
+    motion = math.sqrt(float(np.quantile(squares, LEVEL)) / count)
+    middle = math.sqrt(sum(float(np.median(strength_scales(p))) ** 2 for k in seen for p in [term.strengths[k]]))
     return UpperLimit(term.name, size, 1e3 * motion, size < middle, whole.log_evidence - log_evidence)
 
 
