@@ -14,6 +14,7 @@ from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import InputError
 from masiv.identification.config import RENAMED_STARTS, IdentifyConfig
 from masiv.mpm.config import SimulatorConfig
+from masiv.refinement.config import REMOVED_KEYS as REFINE_REMOVED_KEYS
 from masiv.refinement.config import RENAMED_KEYS as REFINE_RENAMED_KEYS
 from masiv.refinement.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
@@ -38,6 +39,8 @@ RENAMED_KEYS = {
     **{f"refine.{old}": new for old, new in REFINE_RENAMED_KEYS.items()},
 }
 """Keys of earlier versions: section and old name -> new name in the same section."""
+REMOVED_KEYS = tuple(f"refine.{name}" for name in REFINE_REMOVED_KEYS)
+"""Keys of earlier versions that nothing stands for: in the configuration of a run they are left out."""
 RENAMED_VALUES = {"identify.start": RENAMED_STARTS}
 """Values of earlier versions by section and key: old value -> new value."""
 
@@ -75,7 +78,7 @@ def load_config(
     """
     from_file = {} if path is None else renamed_keys(read_yaml(path))
     name = preset or from_file.get("preset")
-    merged: dict[str, Any] = renamed_keys(base or {})
+    merged: dict[str, Any] = without_removed_keys(renamed_keys(base or {}))
     if name is not None or base is None:
         kept = {key: merged[key] for key in ("seed", "arch") if key in merged}
         merged = {**kept, **preset_overlay(str(name or DEFAULT_PRESET))}
@@ -108,6 +111,17 @@ def renamed_keys(config: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(values, dict) and values.get(key) in renamed:
             values[key] = renamed[values[key]]
     return result
+
+
+def without_removed_keys(config: Mapping[str, Any]) -> dict[str, Any]:
+    """``config`` of a run of this or an earlier version, without keys that mean nothing any more."""
+    removed = {tuple(name.split(".")) for name in REMOVED_KEYS}
+    return {
+        section: {k: v for k, v in values.items() if (section, k) not in removed}
+        if isinstance(values, Mapping)
+        else values
+        for section, values in config.items()
+    }
 
 
 def preset_overlay(name: str) -> dict[str, Any]:

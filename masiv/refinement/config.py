@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-RENAMED_KEYS: dict[str, str] = {}
+REMOVED_KEYS = (
+    "noise_threshold", "max_reduced_chi", "search_second_effect", "min_gain", "decisive_gain", "single_parameter_gain",
+    "decisive_variance_ratio", "min_gls_z", "min_bic_gain", "clear_bic_gain", "min_strength_z", "min_vuong_z",
+    "confusable_correlation", "above_noise", "unexplained", "least_gain", "simple_gain", "decisive", "plain_sigmas",
+    "least_bic", "clear_bic", "least_sigmas", "least_apart", "confusable", "second_look",
+)  # fmt: skip
+"""Thresholds of earlier versions, in whose place ``max_null_probability`` and ``min_predictive_p`` decide: runs may have
+them."""
+RENAMED_KEYS = {"least_explained": "min_explained"}
 """Keys of earlier versions: old name -> new name."""
 
 
