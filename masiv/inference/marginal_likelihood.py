@@ -181,9 +181,7 @@ class _Terms:
     gradient: np.ndarray | None = None
 
 
-def marginal(
-    blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, weight: float = 1.0
-) -> Marginal:
+def marginal(blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, weight: float = 1.0) -> Marginal:
     """The marginal likelihood of ``blocks``, over all of them. weight: power of the likelihood, below 1 if the modes are
     not independent of each other (composite likelihood; Varin, Reid & Firth 2011)."""
     likelihood = _Likelihood(blocks, priors, sizes, weight)

@@ -100,15 +100,17 @@ class RefineResult:
     @property
     def verdict(self) -> str:
         """ "unexplained residual" if so large a residual is improbable with nothing missing, whether an effect was added
-        or not; else "effect added"; "nothing missing" if that is more probable than not; "cannot tell" if not, and no
-        effect is probable enough to be named; "ranked only" if none was fitted."""
+        or not; else "effect added"; "nothing missing" if that is more probable than not, and an effect would more
+        probably than not have been seen; else "cannot tell"; "ranked only" if none was fitted."""
         if self.ranked_only:
             return RANKED
         if self.predictive_p["after"] < self.config.min_predictive_p:
             return UNEXPLAINED
         if self.accepted:
             return ADDED
-        return NOTHING if self.search.null_probability > 0.5 else CANNOT_TELL
+        visible = sum(limit.determined for limit in self.search.limits)
+        seen = 2 * visible >= len(self.search.limits)
+        return NOTHING if seen and self.search.null_probability > 0.5 else CANNOT_TELL
 
     @property
     def predictive_p(self) -> Mapping[str, float]:

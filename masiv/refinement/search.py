@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from masiv.inference.robust import robust_scale_of
 from masiv.models.base import ForwardModel
 from masiv.refinement.candidates import score
 from masiv.refinement.effect_fit import BROYDEN_STEPS, fit_with_effect
-from masiv.refinement.hypotheses import Hypothesis, Posterior, linearized, weighed
+from masiv.refinement.hypotheses import Hypothesis, Posterior, linearized, log_prior, weighed
 from masiv.refinement.limits import UpperLimit, try_sensitivity, upper_limit
 from masiv.refinement.rounds import Round, SearchResult
 from masiv.refinement.search_round import run_round
@@ -48,6 +49,8 @@ def search_effects(
     if settings.discrepancy_force and checked["after"] < settings.config.min_predictive_p:
         discrepancy = discrepancy_force(state.with_fit(after), settings)
     limits = _upper_limits(state.with_fit(after), rounds, settings)
+    if after is before:
+        null = _with_unfitted(null, rounds, limits)
     return SearchResult(state.forward_model, before, after, tuple(rounds), null, checked, tuple(limits), discrepancy)
 
 
@@ -104,6 +107,15 @@ def _add_effects(
         state = state.with_fit(done.accepted.fitted).whitened_again()
         bases = [state.fit, *_rivals(state, done)]
     return state, rounds
+
+
+def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperLimit]) -> float:
+    """Probability that no effect acts, effects that were not fitted through the rollout included: their evidence is that
+    of the linear model."""
+    fitted = {t.effect for r in rounds for t in r.trials if t.log_bayes_factor is not None}
+    once = math.exp(log_prior(1, len(limits)) - log_prior(0, len(limits))) if limits else 0.0
+    odds = 1 / null - 1 + sum(once * math.exp(min(x.log_bayes_factor, 700.0)) for x in limits if x.effect not in fitted)
+    return 1 / (1 + odds)
 
 
 def _rivals(state: SearchState, done: Round) -> list[ModelFit]:
