@@ -49,7 +49,7 @@ class LinearModel(ForwardModel):
     def __init__(self, truth, *, seed=0, exclusive=(), diverges=(), noise=NOISE, name="a", effects=EFFECTS):
         self.exclusive, self.diverges, self.effects = exclusive, diverges, dict(effects)
         random = np.random.default_rng(seed)
-        values = self.motion(truth) + random.normal(0.0, noise / np.sqrt(3), (INSTANTS, COUNT, 3))
+        values = POINTS + self.motion(truth) + random.normal(0.0, noise / np.sqrt(3), (INSTANTS, COUNT, 3))
         observation = Observation(
             name=name, times=TIMES, points=POINTS, values=values, fit_count=FITTED, noise_std=NOISE,
             residual_std=np.full(INSTANTS, NOISE),
@@ -81,7 +81,7 @@ class LinearModel(ForwardModel):
             raise NonFiniteError(3, 4, "it flew apart")
         self.rollouts += 1
         stop = None if held_out else FITTED
-        return [(self.motion(values) - e.values)[:stop] for e in self.observations]
+        return [(POINTS + self.motion(values) - e.values)[:stop] for e in self.observations]
 
 
 def baseline(forward_model, effects=()):

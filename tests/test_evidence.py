@@ -17,13 +17,13 @@ def points():
     return np.random.default_rng(0).normal(size=(60, 3)) * [0.3, 0.2, 0.1] + [1.0, 2.0, 3.0]
 
 
-def test_modes_are_orthonormal_and_hold_polynomials_of_third_degree(points):
+def test_modes_are_orthonormal_and_hold_polynomials_of_second_degree(points):
     modes = MotionModes.of(points, 3)
-    assert modes.names == ("translation", "rotation", "strain", "quadratic", "cubic")
+    assert modes.names == ("translation", "rotation", "strain", "quadratic")
     basis = np.concatenate(modes.bases, axis=1)
-    np.testing.assert_allclose(basis.T @ basis, np.eye(60), atol=1e-9)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(30), atol=1e-9)
     x, y, z = (points - points.mean(0)).T
-    field = np.stack([x * y * z + 0.3 * x, y**2 - z, np.ones_like(x)], axis=1)[None]
+    field = np.stack([x * y + 0.3 * x, y**2 - z, np.ones_like(x)], axis=1)[None]
     found = modes.coefficients(field)
     assert sum((c**2).sum() for c in found) == pytest.approx((field**2).sum(2).mean(), rel=1e-9)
 
@@ -52,12 +52,12 @@ def test_points_on_a_line_and_one_point_have_fewer_modes():
     assert MotionModes.of(np.zeros((1, 3)), 2).names == ("translation",)
 
 
-def block(rng, instants=9, modes=2, count=3, sizes=(1.0, 2.0)):
+def block(rng, instants=9, modes=2, count=3, sizes=(1.0, 2.0), weight=1.0):
     times = np.arange(instants) * 0.1
     return ErrorBlock(
         rng.normal(size=(instants, modes)), rng.normal(size=(instants, modes, count)),
         np.abs(np.subtract.outer(times, times)), 0, sizes[0], np.linspace(1, 2, instants) * sizes[1],
-        np.linspace(0, 1, instants), 0.3,
+        np.linspace(0, 1, instants), 0.3, weight,
     )  # fmt: skip
 
 
@@ -71,16 +71,16 @@ def test_marginal_likelihood_is_that_of_a_dense_normal_density():
     c = (values[0] * b.jitter) ** 2 * np.eye(9)
     c += values[1] ** 2 * np.outer(b.smooth, b.smooth) * matern52(b.lags / values[2])
     c += values[3] ** 2 * np.outer(b.grid, b.grid) * matern52(b.lags / b.grid_length)
-    np.testing.assert_allclose(BlockCovariance(b)(logs), c, rtol=1e-12)
+    np.testing.assert_allclose(BlockCovariance(b)(logs), c, rtol=1e-7)
     dense = np.kron(c, np.eye(2))
     j, r = b.jacobian.reshape(18, 3), b.residual.reshape(18) + b.jacobian.reshape(18, 3) @ priors.mean
     for k in range(2):
         whole = dense + j @ np.diag(1 / priors.precision[k]) @ j.T
-        assert float(terms.logp[k]) == pytest.approx(multivariate_normal.logpdf(r, np.zeros(18), whole), rel=1e-9)
+        assert float(terms.logp[k]) == pytest.approx(multivariate_normal.logpdf(r, np.zeros(18), whole), rel=1e-6)
         gain = np.diag(1 / priors.precision[k]) @ j.T @ np.linalg.inv(whole)
-        np.testing.assert_allclose(terms.mean[k], -gain @ r, atol=1e-9)
+        np.testing.assert_allclose(terms.mean[k], -gain @ r, atol=1e-6)
         posterior = np.diag(1 / priors.precision[k]) - gain @ j @ np.diag(1 / priors.precision[k])
-        np.testing.assert_allclose(terms.covariance[k], posterior, atol=1e-9)
+        np.testing.assert_allclose(terms.covariance[k], posterior, atol=1e-6)
 
 
 def test_a_strength_that_cannot_be_negative_has_the_mass_above_zero():
@@ -95,10 +95,10 @@ def test_a_strength_that_cannot_be_negative_has_the_mass_above_zero():
 @pytest.mark.parametrize("positive", [None, 1])
 def test_gradient_by_the_sizes_is_that_of_finite_differences(positive):
     rng = np.random.default_rng(3)
-    blocks = [block(rng), block(rng, modes=4, sizes=(0.5, 1.0))]
+    blocks = [block(rng), block(rng, modes=4, sizes=(0.5, 1.0), weight=0.3)]
     precision = np.array([[0.1, 1.0, 4.0], [0.1, 0.2, 0.3]])
     likelihood = _Likelihood(
-        blocks, ParameterPriors(np.array([0.0, -0.5, 0.2]), precision, positive), SizePriors.of(blocks), 0.3
+        blocks, ParameterPriors(np.array([0.0, -0.5, 0.2]), precision, positive), SizePriors.of(blocks)
     )
     at = np.array([0.2, -0.3, -1.0, 0.4])
     _, gradient = likelihood.objective(at)

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 SQRT5 = 5**0.5
+NUGGET = 1e-8
+"""Variance of smooth errors that is independent from instant to instant, over their variance: Cholesky factors exist."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,8 @@ class ErrorBlock:
 
     residual (T, K) [m]; jacobian (T, K, P) by the fitted scales of P parameters; lags (T, T) [s]. group: index of the
     mode group. jitter [m]: expected jitter of a coefficient; smooth (T,) [m]: expected size of smooth errors of a
-    coefficient; grid (T,) [m]: what another grid would change in it, zero if there is none. grid_length [s].
+    coefficient; grid (T,) [m]: what another grid would change in it, zero if there is none. grid_length [s]. weight: power
+    of the block's likelihood, below 1 if its modes are not independent of each other.
     """
 
     residual: np.ndarray
@@ -33,6 +36,7 @@ class ErrorBlock:
     smooth: np.ndarray
     grid: np.ndarray
     grid_length: float
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ class BlockCovariance:
     def __init__(self, block: ErrorBlock) -> None:
         self.block = block
         self._smooth = np.outer(block.smooth, block.smooth)
-        self._grid = np.outer(block.grid, block.grid) * matern52(block.lags / block.grid_length)
+        self._nugget = NUGGET * np.eye(len(block.lags))
+        self._grid = np.outer(block.grid, block.grid) * (matern52(block.lags / block.grid_length) + self._nugget)
 
     def _parts(self, logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         values, groups, g = np.exp(logs), len(logs) // 3, self.block.group
@@ -83,7 +88,7 @@ class BlockCovariance:
 
     def __call__(self, logs: np.ndarray) -> np.ndarray:
         jitter, smooth, grid = self._parts(logs)
-        return jitter * np.eye(len(grid)) + smooth * matern52(self._distance(logs)) + grid
+        return jitter * np.eye(len(grid)) + smooth * (matern52(self._distance(logs)) + self._nugget) + grid
 
     def gradient(self, logs: np.ndarray, by_covariance: np.ndarray) -> np.ndarray:
         """Gradient (3 G + 1,) of a function by the logarithms, from that by C (T, T)."""
@@ -92,7 +97,7 @@ class BlockCovariance:
         groups, g = len(logs) // 3, self.block.group
         out = np.zeros(len(logs))
         out[g] = 2 * jitter * np.trace(by_covariance)
-        out[groups + g] = 2 * float((by_covariance * smooth * matern52(distance)).sum())
+        out[groups + g] = 2 * float((by_covariance * smooth * (matern52(distance) + self._nugget)).sum())
         out[2 * groups + g] = float((by_covariance * smooth * matern52_by_log_length(distance)).sum())
         out[-1] = 2 * float((by_covariance * grid).sum())
         return out

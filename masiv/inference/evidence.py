@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from masiv.inference.error_covariance import BlockCovariance, ErrorBlock
 from masiv.inference.linear_model import LinearModel
 from masiv.inference.marginal_likelihood import Marginal, ParameterPriors, SizePriors, marginal
-from masiv.inference.motion_modes import TRANSLATION, MotionModes, rotations_since_start
+from masiv.inference.motion_modes import MotionModes, rotations_since_start
 from masiv.models.base import EffectTerm
 from masiv.models.parameters import Parameter
 from masiv.observations.base import Observation
@@ -25,6 +25,10 @@ MIN_TURNED_POINTS = 4
 """Fewer points do not tell how a body has turned."""
 GRID_CORRELATION = 1 / 3
 """Correlation time of what another grid changes, over the length of the record."""
+OBSERVATION_LIMITED_RATIO = 1.5
+"""``residual_std`` over ``noise_std`` below which an instant is observation-limited."""
+MIN_SEGMENT = 2
+"""Instants of a segment, at the least."""
 MAX_INSTANTS = 256
 """A longer record is thinned to as many."""
 DIFFERENCES, DIFFERENCE_VARIANCE = 3, 20.0
@@ -34,11 +38,17 @@ CHI2_MEDIAN = 0.4549
 
 
 @dataclass(frozen=True)
-class _ObservationModes:
-    """An observation in modes of motion. kept: instants (T,); turned: see ``MotionModes.coefficients``. jitter (G,) [m]:
-    expected jitter of a coefficient; smooth (T,) [m]: expected smooth error of a point along an axis; grid: of each
-    group, (T,) [m] by which another grid may change a coefficient."""
+class _Segment:
+    """Instants of an observation in modes of motion: those that are observation-limited, or those from the first on that
+    is not, in which errors of the simulation move all modes together.
 
+    kept: instants (T,); turned: see ``MotionModes.coefficients``. jitter (G,) [m]: expected jitter of a coefficient;
+    smooth (T,) [m]: expected smooth error of a point along an axis; grid: of each group, (T,) [m] by which another grid
+    may change a coefficient; weights (G,): powers of the likelihood of each group; first_group: number of groups of other
+    kinds of segments.
+    """
+
+    index: int
     observation: Observation
     modes: MotionModes
     kept: np.ndarray
@@ -46,10 +56,12 @@ class _ObservationModes:
     jitter: tuple[float, ...]
     smooth: np.ndarray
     grid: tuple[np.ndarray, ...]
+    weights: tuple[float, ...]
+    first_group: int
 
     @classmethod
-    def of(cls, observation: Observation, field: np.ndarray) -> _ObservationModes:
-        """field (T, N, A) [m]: the residual of the best model, which shows the jitter."""
+    def of(cls, index: int, observation: Observation, field: np.ndarray) -> list[_Segment]:
+        """Of observation number ``index``. field (T, N, A) [m]: the residual of the best model."""
         count, axes = field.shape[1:]
         modes = MotionModes.of(observation.points, axes)
         stride = math.ceil(len(field) / MAX_INSTANTS)
@@ -59,15 +71,26 @@ class _ObservationModes:
         if axes == 3 and count >= MIN_TURNED_POINTS:
             positions = np.where(np.isfinite(observation.values), observation.values, observation.points)
             turned = rotations_since_start(observation.points, positions[kept].astype(np.float64))
-        parts = modes.coefficients(field[kept], turned)
+        grid = _grid_changes(observation, modes, kept, turned)
         known = observation.observation_std[kept] / math.sqrt(axes)
-        jitter = [jitter_of(c) for c in parts]
         floor = float(known.min()) / math.sqrt(count)
-        jitter = [j if j > 0 else floor for j in jitter]
+        jitter = tuple(jitter_of(c) or floor for c in modes.coefficients(field[kept], turned))
         smooth = np.full(len(kept), jitter[0]) if count == 1 else known
-        return cls(
-            observation, modes, kept, turned, tuple(jitter), smooth, _grid_changes(observation, modes, kept, turned)
-        )
+        limited = observation.residual_std[kept] < OBSERVATION_LIMITED_RATIO * observation.noise_std
+        split = len(kept) if limited.all() or not observation.grid_corrections else int(np.argmin(limited))
+        out = []
+        for late, part in ((False, slice(0, split)), (True, slice(split, None))):
+            if len(kept[part]) < MIN_SEGMENT:
+                continue
+            own = None if turned is None else turned[part]
+            parts = modes.coefficients(field[kept[part]], own)
+            out.append(
+                cls(
+                    index, observation, modes, kept[part], own, jitter, smooth[part], tuple(g[part] for g in grid),
+                    _weights(parts, together=late), len(modes.names) if late else 0,
+                )
+            )  # fmt: skip
+        return out
 
     def blocks(self, field: np.ndarray, jacobian: np.ndarray) -> list[ErrorBlock]:
         """Of a residual field (T, N, A) [m] and its derivatives (T, N, A, P)."""
@@ -78,12 +101,34 @@ class _ObservationModes:
         groups = len(self.modes.names)
         return [
             ErrorBlock(
-                residual, derivatives, lags, group, self.jitter[group],
+                residual, derivatives, lags, self.first_group + group, self.jitter[group],
                 self.smooth * math.sqrt(self.modes.axes / (residual.shape[1] * groups)), self.grid[group],
-                GRID_CORRELATION * float(lags.max()),
+                GRID_CORRELATION * float(self.observation.times[-1]), self.weights[group],
             )
             for group, (residual, derivatives) in enumerate(zip(residuals, jacobians, strict=True))
         ]  # fmt: skip
+
+
+def _weights(residuals: Sequence[np.ndarray], *, together: bool) -> tuple[float, ...]:
+    """Powers of the likelihoods of groups whose ``residuals`` are (T, K_g): the part of their series that is independent
+    of others in the group; ``together``: of all groups."""
+    series = [independent_series(r) for r in residuals]
+    factor = min(independent_series(np.concatenate(residuals, axis=1)) / sum(series), 1.0) if together else 1.0
+    return tuple(factor * s / r.shape[1] for s, r in zip(series, residuals, strict=True))
+
+
+def independent_series(residual: np.ndarray) -> float:
+    """How many independent series the coefficients (T, K) of a residual are worth, of K: the participation ratio of their
+    covariance over the modes, corrected for how few instants show it.
+
+    What a simulation lacks moves all modes together: then they are one series, not K.
+    """
+    instants, count = residual.shape
+    power = np.linalg.svd(residual, compute_uv=False) ** 2
+    if power.sum() == 0.0:
+        return float(count)
+    inverse = float((power**2).sum() / power.sum() ** 2) - 1 / instants
+    return 1 / max(inverse, 1 / count)
 
 
 def jitter_of(residual: np.ndarray) -> float:
@@ -111,40 +156,22 @@ def _grid_changes(
     )
 
 
-def independent_series(residuals: Sequence[np.ndarray]) -> float:
-    """How many independent series the coefficients (T, K) of residuals are worth, of K: the participation ratio of their
-    covariance over the modes, corrected for how few instants show it.
-
-    What a simulation lacks moves all modes together: then they are one series, not K.
-    """
-    count = residuals[0].shape[1]
-    joined = np.concatenate(residuals)
-    power = np.linalg.svd(joined, compute_uv=False) ** 2
-    if power.sum() == 0.0:
-        return float(count)
-    inverse = float((power**2).sum() / power.sum() ** 2) - 1 / len(joined)
-    return 1 / max(inverse, 1 / count)
-
-
 @dataclass(frozen=True)
 class Evidence:
-    """Works out the evidence of models of ``observations``, with one expectation of errors for all of them. weight: see
-    ``marginal``."""
+    """Works out the evidence of models of ``observations``, with one expectation of errors for all of them."""
 
     observations: Sequence[Observation]
-    parts: tuple[_ObservationModes, ...]
-    weight: float = 1.0
+    segments: tuple[_Segment, ...]
 
     @classmethod
     def of(cls, observations: Sequence[Observation], fields: Sequence[np.ndarray]) -> Evidence:
         """fields: the residual of the best model at all instants."""
-        parts = tuple(_ObservationModes.of(e, f) for e, f in zip(observations, fields, strict=True))
-        residuals = [
-            np.concatenate(part.modes.coefficients(f[part.kept], part.turned), axis=1)
-            for part, f in zip(parts, fields, strict=True)
-        ]
-        same = [r for r in residuals if r.shape[1] == residuals[0].shape[1]]
-        return cls(tuple(observations), parts, independent_series(same) / residuals[0].shape[1])
+        pairs = enumerate(zip(observations, fields, strict=True))
+        segments = [segment for k, (e, f) in pairs for segment in _Segment.of(k, e, f)]
+        used = sorted({s.first_group for s in segments})
+        if used == [len(segments[0].modes.names)]:  # no instant is observation-limited
+            segments = [replace(s, first_group=0) for s in segments]
+        return cls(tuple(observations), tuple(segments))
 
     def marginal(self, linear: LinearModel, terms: Sequence[EffectTerm]) -> Marginal:
         """The marginal likelihood of a model with the effects ``terms``."""
@@ -153,18 +180,19 @@ class Evidence:
     def marginal_with(self, linear: LinearModel, priors: ParameterPriors) -> Marginal:
         """The same with other ``priors`` of its parameters."""
         blocks = self.blocks(linear)
-        return marginal(blocks, priors, SizePriors.of(blocks), self.weight)
+        return marginal(blocks, priors, SizePriors.of(blocks))
 
     def blocks(self, linear: LinearModel) -> list[ErrorBlock]:
         """Of all observations; columns are the model's parameters, then the nuisance of each observation."""
         widths = [n.shape[-1] for n in linear.nuisance]
         out = []
-        for k, part in enumerate(self.parts):
+        for segment in self.segments:
+            k = segment.index
             own = [
                 linear.nuisance[j] if j == k else np.zeros((*linear.fields[k].shape, widths[j]))
-                for j in range(len(self.parts))
+                for j in range(len(self.observations))
             ]
-            out += part.blocks(linear.fields[k], np.concatenate([linear.jacobians[k], *own], axis=-1))
+            out += segment.blocks(linear.fields[k], np.concatenate([linear.jacobians[k], *own], axis=-1))
         return out
 
     def priors(self, linear: LinearModel, terms: Sequence[EffectTerm]) -> ParameterPriors:
@@ -217,7 +245,7 @@ def predictive_p(evidence: Evidence, linear: LinearModel, terms: Sequence[Effect
     predictive check; Box, J. R. Stat. Soc. A 143, 1980).
 
     Residuals are compared after the fit that takes errors for what is expected of them. The modes of a draw are as
-    dependent on each other as those of the residual (``Evidence.weight``).
+    dependent on each other as those of the residual.
     """
     blocks, priors = evidence.blocks(linear), evidence.priors(linear, terms)
     sizes = SizePriors.of(blocks)
@@ -239,7 +267,7 @@ def predictive_p(evidence: Evidence, linear: LinearModel, terms: Sequence[Effect
         drawn = []
         for b, c in zip(blocks, covariances, strict=True):
             modes = b.residual.shape[1]
-            count = max(1, round(modes * evidence.weight))
+            count = max(1, round(modes * b.weight))
             series = np.linalg.cholesky(c(logs)) @ rng.normal(size=(len(b.lags), count))
             directions = np.linalg.qr(rng.normal(size=(modes, count)))[0]
             drawn.append(series @ directions.T * math.sqrt(modes / count))

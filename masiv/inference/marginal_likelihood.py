@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import log_ndtr
 
 from masiv.inference.error_covariance import BlockCovariance, ErrorBlock, ErrorSizes
 
@@ -95,15 +95,13 @@ def _interval(lags: np.ndarray) -> float:
 class _Likelihood:
     """The marginal likelihood as a function of the logarithms of the sizes."""
 
-    def __init__(
-        self, blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, weight: float = 1.0
-    ) -> None:
+    def __init__(self, blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors) -> None:
         self.covariances = [BlockCovariance(b) for b in blocks]
         # The residual at the prior mean, and the derivatives: (T, K, 1 + P).
         self.data = [
             np.concatenate([(b.residual + b.jacobian @ priors.mean)[:, :, None], b.jacobian], axis=2) for b in blocks
         ]
-        self.priors, self.sizes, self.weight = priors, sizes, weight
+        self.priors, self.sizes = priors, sizes
 
     def terms(self, logs: np.ndarray, *, gradient: bool = False) -> _Terms:
         """Of each component of the prior; with the gradient of the sum of all by ``logs`` if asked for."""
@@ -115,23 +113,24 @@ class _Likelihood:
             flat = data.reshape(len(data), -1)
             white = solve_triangular(factor, flat, lower=True, check_finite=False)
             rows = white.reshape(-1, columns)
-            gram += rows.T @ rows
-            constant -= data.shape[1] * (np.log(factor.diagonal()).sum() + 0.5 * len(data) * LOG2PI)
+            gram += covariance.block.weight * (rows.T @ rows)
+            constant -= (
+                covariance.block.weight * data.shape[1] * (np.log(factor.diagonal()).sum() + 0.5 * len(data) * LOG2PI)
+            )
             whitened.append((factor, white))
-        gram *= self.weight
         logp, mean, covariance, by_gram = self._components(gram)
-        terms = _Terms(self.weight * constant + logp, mean, covariance)
+        terms = _Terms(constant + logp, mean, covariance)
         if not gradient:
             return terms
-        share = np.exp(terms.logp - logsumexp(terms.logp))
+        share = np.exp(terms.logp - np.logaddexp.reduce(terms.logp))
         slope = np.tensordot(share, by_gram, 1)
         out = np.zeros(len(logs))
         for block, data, (factor, white) in zip(self.covariances, self.data, whitened, strict=True):
-            solved = solve_triangular(factor, white, lower=True, trans="T", check_finite=False)
+            solved = solve_triangular(factor, white, lower=True, trans=1, check_finite=False)
             shaped = solved.reshape(data.shape)
             spread = (shaped @ slope).reshape(len(data), -1) @ solved.T
             inverse = cho_solve((factor, True), np.eye(len(data)), check_finite=False)
-            out += block.gradient(logs, -self.weight * (0.5 * data.shape[1] * inverse + spread))
+            out += block.gradient(logs, -block.block.weight * (0.5 * data.shape[1] * inverse + spread))
         return replace(terms, gradient=out)
 
     def _components(self, gram: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -167,8 +166,8 @@ class _Likelihood:
         terms = self.terms(logs, gradient=True)
         assert terms.gradient is not None
         z = (logs - self.sizes.mean) / self.sizes.sd
-        value = logsumexp(terms.logp) - math.log(len(terms.logp)) - 0.5 * float(z @ z)
-        return -float(value), -(terms.gradient - z / self.sizes.sd)
+        value = float(np.logaddexp.reduce(terms.logp)) - math.log(len(terms.logp)) - 0.5 * float(z @ z)
+        return -value, -(terms.gradient - z / self.sizes.sd)
 
 
 @dataclass(frozen=True)
@@ -181,10 +180,10 @@ class _Terms:
     gradient: np.ndarray | None = None
 
 
-def marginal(blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, weight: float = 1.0) -> Marginal:
-    """The marginal likelihood of ``blocks``, over all of them. weight: power of the likelihood, below 1 if the modes are
-    not independent of each other (composite likelihood; Varin, Reid & Firth 2011)."""
-    likelihood = _Likelihood(blocks, priors, sizes, weight)
+def marginal(blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors) -> Marginal:
+    """The marginal likelihood of ``blocks``, over all of them: a composite likelihood (Varin, Reid & Firth 2011) if their
+    weights are not 1."""
+    likelihood = _Likelihood(blocks, priors, sizes)
     reach = 6.0 * sizes.sd
     bounds = list(zip(sizes.mean - reach, sizes.mean + reach, strict=True))
     # The posterior has several modes: a rough residual is jitter, or smooth errors of a short time.
@@ -199,7 +198,7 @@ def marginal(blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizeP
     # Volume of the posterior of the sizes over that of their prior.
     volume = -0.5 * np.linalg.slogdet(hessian * np.outer(sizes.sd, sizes.sd))[1]
     terms = likelihood.terms(found.x)
-    weights = np.exp(terms.logp - logsumexp(terms.logp))
+    weights = np.exp(terms.logp - np.logaddexp.reduce(terms.logp))
     mean = weights @ terms.mean
     apart = terms.mean - mean
     spread = np.tensordot(weights, terms.covariance + apart[:, :, None] * apart[:, None, :], 1)

@@ -1,8 +1,8 @@
-"""Modes of a body's motion: translation, rotation, uniform strain, and polynomials of second and third degree.
+"""Modes of a body's motion: translation, rotation, uniform strain, and polynomials of second degree.
 
 A residual field is written in fields that are orthonormal over the body's points. Errors of one kind have sizes and
 time scales of their own: a calibration that is off shifts the mean, texture that slides turns about the centre, few
-cameras leave finer modes open. Modes beyond the third degree are no evidence: they are left out.
+cameras leave finer modes open. Modes beyond the second degree are no evidence: they are left out.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-MAX_DEGREE = 3
+MAX_DEGREE = 2
 RANK_TOL = 1e-3
 """Singular value over the largest below which points do not tell two polynomials apart."""
 TRANSLATION, ROTATION, STRAIN = "translation", "rotation", "strain"
-OF_DEGREE = {2: "quadratic", 3: "cubic"}
+OF_DEGREE = {2: "quadratic"}
 
 
 @dataclass(frozen=True)
