@@ -145,15 +145,15 @@ def balls(source: Path) -> dict:
         "shared": [
             {"bodies": s.term.bodies,
              "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.term.effect)},
-             "spread": s.strength_std, "information_gain": s.bic_gain,
+             "spread": s.strength_std, "log_bayes_factor": s.log_bayes_factor,
              "held_out_mm": alike(s.fitted.model, s.fitted.values, fitted=False)}
             for s in refined.shared
         ],
         "gravity_each": [9.8 * (1 + trap.values[p.name]) for p in each.parameters],
         "information_gain_of_gravity_each": result.before.bic(trap.samples) - trap.bic(trap.samples),
         "trials": {
-            n: {"fit_mm": t.fitted.fit_mm, "held_out_mm": t.fitted.held_out_mm, "objections": list(t.objections),
-                "information_gain": result.before.bic(t.fitted.samples) - t.fitted.bic(t.fitted.samples)}
+            n: {"fit_mm": t.fitted.fit_mm, "held_out_mm": t.fitted.held_out_mm, "impossible": list(t.impossible),
+                "log_bayes_factor": t.log_bayes_factor}
             for n, t in first.items()
         },
         "gravity": 9.8 * (1 + first["gravity_scale"].fitted.values["gravity_scale.relative_change"])

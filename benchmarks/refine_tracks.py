@@ -135,7 +135,7 @@ def oracle_of(case, config):
 
 
 def refined(case, config):
-    from masiv.refinement.rounds import similar_to_accepted
+    from masiv.refinement.rounds import alternatives
     from masiv.refinement.search_state import SearchSettings
     from masiv.refinement.stage import refine
 
@@ -158,17 +158,17 @@ def refined(case, config):
         "residual_std_mm": (1e3 * refined.observations[0].residual_std).round(1).tolist(),
         "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
         "trials": [
-            (t.law, t.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.objections)
+            (t.law, t.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.log_bayes_factor, t.impossible)
             for r in result.rounds for t in r.trials
         ],
         "accepted": list(accepted),
         "indistinguishable_from": {
-            name: similar_to_accepted(name, result.rounds)["indistinguishable_from"] for name in accepted
+            name: list(alternatives(name, result.after, result.rounds)) for name in accepted
         },
         "law": result.after.model.family.kind,
         "values": result.after.values,
         "stderr": result.after.stderr,
-        "confusable": first.confusable if first else {},
+        "null_probability": result.null_probability,
         "before": [result.before.fit_mm, result.before.held_out_mm],
         "after": [result.after.fit_mm, result.after.held_out_mm],
         "seconds": [middle - began, end - middle],

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
-from masiv.inference.discretization import with_grid_errors, with_residual_std
-from masiv.inference.model_fit import ModelFit
+from masiv.inference.discretization import with_residual_std
 from masiv.models.base import ForwardModel
 from masiv.models.parameters import Parameter
 from masiv.observations.base import Observation
@@ -80,26 +77,3 @@ def test_what_a_fit_absorbs_or_all_grids_change_is_no_uncertainty():
     )
     assert found().grid_corrections == ()
     np.testing.assert_array_equal(found().residual_std, NOISE)
-
-
-def test_standard_errors_hold_what_one_more_grid_would_move():
-    random = np.random.default_rng(3)
-    jacobian = random.normal(size=(ROWS * POINTS * 3, 2))
-    common, apart = np.zeros((2, INSTANTS, POINTS, 3))
-    common[:ROWS] = 1e-2 * random.normal(size=(ROWS, POINTS, 3))
-    apart[:ROWS] = 1e-2 * (jacobian @ np.array([3.0, -0.5])).reshape(ROWS, POINTS, 3)
-    observations = Changing().observations
-    share = Parameter("grid_change@0", 0.0, -1.0, 3.0, 0.25)
-    values = {share.name: 0.7, "a": 1.0, "b": 2.0}
-    columns = np.concatenate([common[:ROWS].reshape(-1, 1), jacobian], axis=1)
-    params = [share, parameters()[0], Parameter("b", 1.0, 0.1, 9.0, 1e-3, log=True)]
-    errors = dict(zip(values, (0.1, 0.01, 0.02), strict=True))
-    fitted = ModelFit(None, values, tuple(params), np.zeros(len(jacobian)), columns, 1.0, 9, 1.0, 1.0, [], errors)
-    assert with_grid_errors(observations, fitted, 1.0) is fitted  # no grid is known to change anything
-    changes = (common + apart, common - apart)
-    observations = (replace(observations[0], grid_corrections=changes),)
-    found = with_grid_errors(observations, fitted, 1.0).stderr
-    # The mean's own size is what its share is for; a third grid is off it by the square root of three times as much.
-    assert found[share.name] == pytest.approx(errors[share.name])
-    assert found["a"] == pytest.approx(np.hypot(0.01, np.sqrt(3) * 1e-2 * 3.0))
-    assert found["b"] == pytest.approx(np.hypot(0.02, np.sqrt(3) * 1e-2 * 0.5 * values["b"]))

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_fits import fit_with
 
 from masiv.errors import NonFiniteError
+from masiv.inference.model_fit import ModelFit
+from masiv.models.base import Model
+from masiv.models.families import Family
 from masiv.refinement.candidates import Candidate, Ranking
 from masiv.refinement.experiment_design import INITIAL_STATES, propose
 from masiv.refinement.from_video import Recording, split_frames, with_unique_names
+from masiv.refinement.hypotheses import Hypothesis, Posterior
 from masiv.refinement.rounds import Round, SearchResult, Trial
 from masiv.scene.transforms import SimulationFrame
 
@@ -54,8 +57,14 @@ class Thrown:
 
 def search_of(forward_model):
     candidate = Candidate("linear_drag", 0.9, {}, {}, np.zeros((0, 0)), np.zeros(0))
-    trials = tuple(Trial(candidate, fit_with(1, 1, effects=(name,))) for name in ("linear_drag", "quadratic_drag"))
-    first = Round(UNUSED, Ranking(), trials, trials[0], {}, ("quadratic_drag",))
+    family = Family("rigid", (), {})
+    fits = [
+        ModelFit(Model(family, "none", (name,)), {}, (), np.zeros(0), np.zeros((0, 0)), 1.0, 9, 1.0, 1.0, [], {})
+        for name in ("linear_drag", "quadratic_drag")
+    ]
+    trials = tuple(Trial(candidate, fitted) for fitted in fits)
+    hypotheses = [Hypothesis(f, UNUSED, SimpleNamespace(log_evidence=float(k))) for k, f in enumerate(fits)]
+    first = Round(UNUSED, Ranking(), trials, trials[0], Posterior.of(hypotheses, 2))
     return SearchResult(forward_model, trials[0].fitted, trials[0].fitted, (first,))
 
 

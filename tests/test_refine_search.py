@@ -9,15 +9,13 @@ import pytest
 from linear_model import EFFECTS, NOISE, ONES, POINTS, TIMES, LinearModel, baseline, pattern
 
 from masiv.errors import InputError, MasivError
-from masiv.inference.model_fit import gauss_newton_fit
-from masiv.models.base import Model
 from masiv.models.families import Family
 from masiv.refinement.candidates import score
 from masiv.refinement.config import RefineConfig
 from masiv.refinement.document import document, text
 from masiv.refinement.effect_fit import fit_with_effect
 from masiv.refinement.rounds import Trial
-from masiv.refinement.search import DISCREPANCY_FORCE, whitened_start
+from masiv.refinement.search import DISCREPANCY_FORCE
 from masiv.refinement.search_round import could_improve
 from masiv.refinement.search_state import SearchSettings
 from masiv.refinement.stage import refine
@@ -103,7 +101,7 @@ def test_effects_that_exclude_each_other_are_never_in_one_model(named):
     model = LinearModel(strengths, exclusive=("linear_drag", "body_force"))
     result = refined(model, {"effects": named})
     assert [t.name for t in result.accepted] == ["body_force", "gravity_scale"]
-    first, second = result.search.rounds
+    first, second, *_ = result.search.rounds
     assert first.ranking.not_ranked == {}
     assert second.ranking.not_ranked == ({"linear_drag": "it cannot act here in addition"} if named else {})
 

@@ -21,20 +21,23 @@ ERRORS = {
 def document(**changes):
     refit = {
         "law": "neo_hookean", "effect": "linear_drag", "explained": 0.81, "fit_rmse_mm": 4.2, "held_out_rmse_mm": 13.1,
-        "parameters": {"rate": {"value": 0.72, "stderr": 0.02}}, "information_gain": 900.0, "accepted": True,
-        "objections": [],
+        "parameters": {"rate": {"value": 0.72, "stderr": 0.02}}, "log_bayes_factor": 900.0, "accepted": True,
+        "converged": True, "impossible": [],
     }  # fmt: skip
-    refused = refit | {"effect": "swirl", "accepted": False, "objections": ["held out <gets> worse"], "parameters": {}}
+    refused = refit | {"effect": "swirl", "accepted": False, "impossible": ["it <cannot> be"], "parameters": {}}
     whole = {
-        "schema": 2, "noise_floor_mm": 2.5, "discretization_mm": {"fit": 3.0, "held_out": 4.0},
+        "schema": 3, "null_probability": 0.0021, "predictive_p": {"before": 0.004, "after": 0.6},
+        "credible_set": [{"effects": ["linear_drag"], "probability": 0.97}],
+        "upper_limits": [{"effect": "restitution", "scope": "all", "strength": 0.0345, "unit": "1", "motion_mm": 2.25,
+                          "determined": True}], "noise_floor_mm": 2.5, "discretization_mm": {"fit": 3.0, "held_out": 4.0},
         "grid_change": {"before": 0.4, "after": 0.625},
         "residual_mm": {"fit": 10.7, "held_out": 40.2},
         "candidates": [
             {"effect": "linear_drag", "explained": 0.81, "theta": 0.7, "unit": "1/s", "stderr": 0.02,
-             "parameters": {"rate": 0.7}, "confusable_with": ["quadratic_drag"], "looks_like": "slows & slows"},
+             "parameters": {"rate": 0.7}, "probability": 0.97, "looks_like": "slows & slows"},
         ],
         "accepted": [{"effect": "linear_drag", "theta": {"rate": 0.7234}, "stderr": {"rate": 0.0213},
-                      "unit": {"rate": "1/s"}}],
+                      "unit": {"rate": "1/s"}, "indistinguishable_from": ["quadratic_drag"]}],
         "before": ERRORS,
         "after": {"fit": ERRORS["fit"] | {"trajectory_rmse_mm": 4.2},
                   "held_out": ERRORS["held_out"] | {"trajectory_rmse_mm": 13.1}},
@@ -83,8 +86,19 @@ def test_numbers_and_pictures_of_an_accepted_effect(tmp_path):
     write(tmp_path, document(), fields())
     section = section_of(tmp_path, np.array([0.0, 1.0, 0.0]))
     assert section.count("data:image/png;base64,") == 2
-    shown = ["effect added: linear drag", "0.7234", "0.0213", "81 %", "10.7 → 4.2", "40.2 → 13.1", "quadratic drag"]
-    markup = ["held out &lt;gets&gt; worse", "slows &amp; slows"]  # text is never markup
+    shown = [
+        "effect added: linear drag",
+        "0.7234",
+        "0.0213",
+        "81 %",
+        "10.7 → 4.2",
+        "40.2 → 13.1",
+        "quadratic drag",
+        "0.0345",
+        "2.25",
+        "0.0021",
+    ]
+    markup = ["it &lt;cannot&gt; be", "slows &amp; slows"]  # text is never markup
     assert "0.625 of what finer grids change" in section
     assert [text for text in (*shown, "61", "12 to 15", "0.31", *markup) if text not in section] == []
 

@@ -132,7 +132,7 @@ def test_damping_is_found_and_the_law_with_it(bar):
     assert after.held_out_mm < 0.1
     assert after.held_out_mm < 0.25 * result.before.held_out_mm
     drag = [t for t in result.search.rounds[0].trials if t.effect == "linear_drag"]
-    assert [any("it takes a medium of" in why for why in t.objections) for t in drag] == [True]
+    assert [any("it takes a medium of" in why for why in t.impossible) for t in drag] == [True]
 
 
 @pytest.mark.slow

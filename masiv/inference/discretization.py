@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from masiv.inference.model_fit import ModelFit
-from masiv.inference.robust import soft_l1_weight
 from masiv.models.base import ForwardModel
 from masiv.models.free_body import GRID_CORRECTION
 from masiv.observations.base import Observation
@@ -46,30 +45,6 @@ def with_residual_std(
         std = np.hypot(seen, np.maximum.accumulate(grid))
         out.append(replace(e, residual_std=std, grid_corrections=tuple(changes[k])))
     return forward_model.with_observations(out)
-
-
-def with_grid_errors(observations: Sequence[Observation], fitted: ModelFit, robust_scale: float) -> ModelFit:
-    """``fitted`` with standard errors that hold, in addition to what noise does to the values, by how much they would
-    move if the truth were one more grid: with what it changes beyond the mean, which no factor makes up for.
-
-    robust_scale [m]: whitened residuals above it are outliers.
-    """
-    if not all(e.grid_corrections for e in observations) or not fitted.parameters:
-        return fitted
-    beyond = [[e.whiten((c - e.grid_correction)[: e.fit_count]) for c in e.grid_corrections] for e in observations]
-    weight = soft_l1_weight(fitted.residual, robust_scale)
-    columns = fitted.jacobian * weight[:, None]
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    moved = []
-    for grid in zip(*beyond, strict=True):
-        change = np.concatenate([field.ravel() for field in grid])
-        moved.append(np.linalg.lstsq(columns / scale, change * weight, rcond=1e-8)[0] / scale)
-    apart = _one_more(len(moved)) * np.sqrt(np.mean(np.square(moved), axis=0))
-    errors = {
-        p.name: math.hypot(fitted.stderr[p.name], change * (abs(fitted.values[p.name]) if p.log else 1.0))
-        for p, change in zip(fitted.parameters, apart, strict=True)
-    }
-    return replace(fitted, stderr={**fitted.stderr, **errors})
 
 
 def _one_more(count: int) -> float:

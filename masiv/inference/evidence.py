@@ -29,6 +29,8 @@ OBSERVATION_LIMITED_RATIO = 1.5
 """``residual_std`` over ``noise_std`` below which an instant is observation-limited."""
 MIN_SEGMENT = 2
 """Instants of a segment, at the least."""
+MIN_SERIES = 0.1
+"""Independent series of a group that moves with others, at the least."""
 MAX_INSTANTS = 256
 """A longer record is thinned to as many."""
 DIFFERENCES, DIFFERENCE_VARIANCE = 3, 20.0
@@ -111,10 +113,15 @@ class _Segment:
 
 def _weights(residuals: Sequence[np.ndarray], *, together: bool) -> tuple[float, ...]:
     """Powers of the likelihoods of groups whose ``residuals`` are (T, K_g): the part of their series that is independent
-    of others in the group; ``together``: of all groups."""
+    of others in the group; ``together``: and of the groups before, the first of which is the mean motion."""
     series = [independent_series(r) for r in residuals]
-    factor = min(independent_series(np.concatenate(residuals, axis=1)) / sum(series), 1.0) if together else 1.0
-    return tuple(factor * s / r.shape[1] for s, r in zip(series, residuals, strict=True))
+    if together:
+        known = 0.0
+        for k in range(len(series)):
+            whole = max(independent_series(np.concatenate(residuals[: k + 1], axis=1)), known)
+            series[k] = min(series[k], max(whole - known, MIN_SERIES))
+            known = whole
+    return tuple(s / r.shape[1] for s, r in zip(series, residuals, strict=True))
 
 
 def independent_series(residual: np.ndarray) -> float:

@@ -17,8 +17,8 @@ from masiv.models.free_body import GRID_CORRECTION
 from masiv.observations.base import rms_mm
 from masiv.refinement.answer import answer, outcome
 from masiv.refinement.candidates import Candidate
-from masiv.refinement.result import ADDED, NOTHING, RANKED, BodyResult, Proposal, RefineResult, SharedFit
 from masiv.refinement.limits import UpperLimit
+from masiv.refinement.result import ADDED, NOTHING, RANKED, BodyResult, Proposal, RefineResult, SharedFit
 from masiv.refinement.rounds import Round, Trial, alternatives
 from masiv.refinement.search import DISCREPANCY_FORCE
 

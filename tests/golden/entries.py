@@ -33,9 +33,7 @@ SAMPLE = {
     "refine": {
         "processes": 1, "particles": 200, "search_particles": 100, "families": 1, "laws": ["neo_hookean"],
         "effects": ["linear_drag", "body_force", "gravity_scale"], "baseline_rollouts": 6, "shortlist": 2,
-        "max_effects": 1, "search_second_effect": False, "tracking_error": 0, "max_reduced_chi": 5, "min_gain": 0,
-        "decisive_gain": 0, "single_parameter_gain": 0, "decisive_variance_ratio": 1, "min_gls_z": 0, "min_bic_gain": 0,
-        "clear_bic_gain": 0, "min_strength_z": 0,
+        "max_effects": 1, "tracking_error": 0, "min_explained": 0, "max_null_probability": 0.999999, "min_predictive_p": 0,
     },
 }  # fmt: skip
 BAR = {
@@ -134,7 +132,7 @@ ENTRIES = {
     "case_control_elastic": partial(
         track_case, "control_elastic",
         {
-            "families": 2, "laws": ["neo_hookean", "von_mises", "newtonian"], "noise_threshold": 0,
+            "families": 2, "laws": ["neo_hookean", "von_mises", "newtonian"],
             "effects": ["linear_drag", "body_force"],
         },
     ),
