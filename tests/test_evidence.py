@@ -36,7 +36,7 @@ def test_rotation_of_a_turned_body_is_a_rotation_and_a_shift_stays_a_shift(point
     turned = rotations_since_start(points, now[None])
     np.testing.assert_allclose(turned[0], turn, atol=1e-9)
     spin = np.cross([0.3, -0.2, 0.5], now)
-    shift, rotation, *rest = modes.coefficients((spin + [1.0, 0.0, 0.0])[None], turned)
+    shift, rotation, *rest = modes.coefficients((spin + np.eye(3)[0])[None], turned)
     np.testing.assert_allclose(shift[0], [1.0, 0.0, 0.0], atol=1e-9)
     assert (rotation**2).sum() == pytest.approx((spin**2).sum(1).mean())
     assert max(np.abs(c).max() for c in rest) < 1e-9
@@ -124,8 +124,8 @@ def test_jitter_is_seen_under_a_smooth_motion():
 
 
 def drawn(rng, slope, instants=40):
-    """A straight line with ``slope``, of which place and speed are unknown, with an effect that bends it; jitter and smooth
-    errors."""
+    """A straight line with ``slope``, of which place and speed are unknown, with an effect that bends it; jitter and
+    smooth errors."""
     times = np.linspace(0, 1, instants)
     lags = np.abs(np.subtract.outer(times, times))
     size, length = rng.uniform(0, 3), np.exp(rng.uniform(np.log(0.05), 0.0))

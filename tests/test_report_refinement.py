@@ -29,8 +29,8 @@ def document(**changes):
         "schema": 3, "null_probability": 0.0021, "predictive_p": {"before": 0.004, "after": 0.6},
         "credible_set": [{"effects": ["linear_drag"], "probability": 0.97}],
         "upper_limits": [{"effect": "restitution", "scope": "all", "strength": 0.0345, "unit": "1", "motion_mm": 2.25,
-                          "determined": True}], "noise_floor_mm": 2.5, "discretization_mm": {"fit": 3.0, "held_out": 4.0},
-        "grid_change": {"before": 0.4, "after": 0.625},
+                          "determined": True}], "noise_floor_mm": 2.5, "discretization_mm": {"fit": 3.0, "held_out":
+        4.0}, "grid_change": {"before": 0.4, "after": 0.625},
         "residual_mm": {"fit": 10.7, "held_out": 40.2},
         "candidates": [
             {"effect": "linear_drag", "explained": 0.81, "theta": 0.7, "unit": "1/s", "stderr": 0.02,

@@ -2,7 +2,10 @@ r"""Errors of an observation in one group of modes: jitter, smooth errors, and w
 
 Each coefficient of group :math:`g` is a Gaussian process in time, independent of the others, with covariance
 
-.. math::  C_g(t, t') = j_g^2 \delta_{tt'} + s_g^2 u(t) u(t') k(|t - t'| / \ell_g) + \gamma^2 d_g(t) d_g(t') k(|t - t'| / \ell_d)
+.. math::
+
+    C_g(t, t') = j_g^2 \delta_{tt'} + s_g^2 u(t) u(t') k(|t - t'| / \ell_g)
+    + \gamma^2 d_g(t) d_g(t') k(|t - t'| / \ell_d)
 
 with the Matern function :math:`k` of order 5/2 (Rasmussen & Williams 2006, eq. 4.17).
 """
@@ -15,7 +18,8 @@ import numpy as np
 
 SQRT5 = 5**0.5
 NUGGET = 1e-8
-"""Variance of smooth errors that is independent from instant to instant, over their variance: Cholesky factors exist."""
+"""Variance of smooth errors that is independent from instant to instant, over their variance: Cholesky factors
+exist."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +28,8 @@ class ErrorBlock:
 
     residual (T, K) [m]; jacobian (T, K, P) by the fitted scales of P parameters; lags (T, T) [s]. group: index of the
     mode group. jitter [m]: expected jitter of a coefficient; smooth (T,) [m]: expected size of smooth errors of a
-    coefficient; grid (T,) [m]: what another grid would change in it, zero if there is none. grid_length [s]. weight: power
-    of the block's likelihood, below 1 if its modes are not independent of each other.
+    coefficient; grid (T,) [m]: what another grid would change in it, zero if there is none. grid_length [s]. weight:
+    power of the block's likelihood, below 1 if its modes are not independent of each other.
     """
 
     residual: np.ndarray

@@ -41,13 +41,13 @@ CHI2_MEDIAN = 0.4549
 
 @dataclass(frozen=True)
 class _Segment:
-    """Instants of an observation in modes of motion: those that are observation-limited, or those from the first on that
-    is not, in which errors of the simulation move all modes together.
+    """Instants of an observation in modes of motion: those that are observation-limited, or those from the first on
+    that is not, in which errors of the simulation move all modes together.
 
     kept: instants (T,); turned: see ``MotionModes.coefficients``. jitter (G,) [m]: expected jitter of a coefficient;
     smooth (T,) [m]: expected smooth error of a point along an axis; grid: of each group, (T,) [m] by which another grid
-    may change a coefficient; weights (G,): powers of the likelihood of each group; first_group: number of groups of other
-    kinds of segments.
+    may change a coefficient; weights (G,): powers of the likelihood of each group; first_group: number of groups of
+    other kinds of segments.
     """
 
     index: int
@@ -112,7 +112,8 @@ class _Segment:
 
 
 def _weights(residuals: Sequence[np.ndarray], *, together: bool) -> tuple[float, ...]:
-    """Powers of the likelihoods of groups whose ``residuals`` are (T, K_g): the part of their series that is independent
+    """Powers of the likelihoods of groups whose ``residuals`` are (T, K_g): the part of their series that is
+    independent
     of others in the group; ``together``: and of the groups before, the first of which is the mean motion."""
     series = [independent_series(r) for r in residuals]
     if together:
@@ -125,8 +126,8 @@ def _weights(residuals: Sequence[np.ndarray], *, together: bool) -> tuple[float,
 
 
 def independent_series(residual: np.ndarray) -> float:
-    """How many independent series the coefficients (T, K) of a residual are worth, of K: the participation ratio of their
-    covariance over the modes, corrected for how few instants show it.
+    """How many independent series the coefficients (T, K) of a residual are worth, of K: the participation ratio of
+    their covariance over the modes, corrected for how few instants show it.
 
     What a simulation lacks moves all modes together: then they are one series, not K.
     """
@@ -203,8 +204,8 @@ class Evidence:
         return out
 
     def priors(self, linear: LinearModel, terms: Sequence[EffectTerm]) -> ParameterPriors:
-        """Strengths: a mixture of normal densities about zero. All others: flat, over the range that is possible and that
-        this recording could show."""
+        """Strengths: a mixture of normal densities about zero. All others: flat, over the range that is possible and
+        that this recording could show."""
         names = [p.name for p in linear.parameters]
         terms = [t for t in terms if all(p.name in names for p in t.strengths)]  # the others are known
         nuisance = sum(n.shape[-1] for n in linear.nuisance)
@@ -248,8 +249,8 @@ PREDICTIVE_DRAWS = 400
 
 
 def predictive_p(evidence: Evidence, linear: LinearModel, terms: Sequence[EffectTerm], seed: int = 0) -> float:
-    """Probability of a residual as large as that of the model, if nothing is missing and the errors are as expected (prior
-    predictive check; Box, J. R. Stat. Soc. A 143, 1980).
+    """Probability of a residual as large as that of the model, if nothing is missing and the errors are as expected
+    (prior predictive check; Box, J. R. Stat. Soc. A 143, 1980).
 
     Residuals are compared after the fit that takes errors for what is expected of them. The modes of a draw are as
     dependent on each other as those of the residual.

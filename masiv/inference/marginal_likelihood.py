@@ -6,8 +6,8 @@ priors :math:`\theta \sim N(\mu, \Lambda^{-1})` and Gaussian errors :math:`N(0, 
 .. math::  \log p(r) = \log N(r + J (\mu - \hat\theta);\ 0,\ C + J \Lambda^{-1} J^T),
 
 (Bishop 2006, sec. 3.5). The sizes of the errors are where it is largest together with their prior, times the volume of
-their posterior (Laplace; MacKay 1992). The prior of an effect's strength is a mixture of normal densities about zero whose
-scales are spread evenly in the logarithm: a strength of any size is nearly as likely.
+their posterior (Laplace; MacKay 1992). The prior of an effect's strength is a mixture of normal densities about zero
+whose scales are spread evenly in the logarithm: a strength of any size is nearly as likely.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class SizePriors:
 
     @classmethod
     def of(cls, blocks: Sequence[ErrorBlock]) -> SizePriors:
-        """Jitter and smooth errors as expected; correlation times between the interval of two instants and the length of
-        the record."""
+        """Jitter and smooth errors as expected; correlation times between the interval of two instants and the length
+        of the record."""
         groups = 1 + max(b.group for b in blocks)
         lengths, spreads = np.zeros(groups), np.ones(groups)
         for g in range(groups):
@@ -181,8 +181,8 @@ class _Terms:
 
 
 def marginal(blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors) -> Marginal:
-    """The marginal likelihood of ``blocks``, over all of them: a composite likelihood (Varin, Reid & Firth 2011) if their
-    weights are not 1."""
+    """The marginal likelihood of ``blocks``, over all of them: a composite likelihood (Varin, Reid & Firth 2011) if
+    their weights are not 1."""
     likelihood = _Likelihood(blocks, priors, sizes)
     reach = 6.0 * sizes.sd
     bounds = list(zip(sizes.mean - reach, sizes.mean + reach, strict=True))
@@ -212,7 +212,8 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
 def _hessian(objective: Objective, at: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Second derivatives of the objective by differences of its gradient; a tenth of those of the prior at the least."""
+    """Second derivatives of the objective by differences of its gradient; a tenth of those of the prior at the
+    least."""
     count = len(at)
     out = np.zeros((count, count))
     for k in range(count):

@@ -151,8 +151,8 @@ class ForwardModel(ABC):
         return np.concatenate([e.whiten(f).ravel() for e, f in found])
 
     def nuisance(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray:
-        """Derivatives (T, N, A, Q) of recording ``index`` by what is fitted to it alone for each model, such as the start
-        of a held-out flight. Q is 0 if there is nothing of the kind."""
+        """Derivatives (T, N, A, Q) of recording ``index`` by what is fitted to it alone for each model, such as the
+        start of a held-out flight. Q is 0 if there is nothing of the kind."""
         return np.zeros((*self.observations[index].values.shape, 0))
 
     def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:

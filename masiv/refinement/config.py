@@ -10,8 +10,8 @@ REMOVED_KEYS = (
     "confusable_correlation", "above_noise", "unexplained", "least_gain", "simple_gain", "decisive", "plain_sigmas",
     "least_bic", "clear_bic", "least_sigmas", "least_apart", "confusable", "second_look",
 )  # fmt: skip
-"""Thresholds of earlier versions, in whose place ``max_null_probability`` and ``min_predictive_p`` decide: runs may have
-them."""
+"""Thresholds of earlier versions, in whose place ``max_null_probability`` and ``min_predictive_p`` decide: runs may
+have them."""
 RENAMED_KEYS = {"least_explained": "min_explained"}
 """Keys of earlier versions: old name -> new name."""
 

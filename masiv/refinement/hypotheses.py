@@ -64,8 +64,8 @@ def weighed(forward_model: ForwardModel, fits: Sequence[ModelFit], linear: Seque
 
 @dataclass(frozen=True)
 class Posterior:
-    """Probabilities of ``hypotheses``. Sets of as many effects are equally likely beforehand, and one effect more is half
-    as likely in all (Scott & Berger 2010); so are laws.
+    """Probabilities of ``hypotheses``. Sets of as many effects are equally likely beforehand, and one effect more is
+    half as likely in all (Scott & Berger 2010); so are laws.
 
     candidates: effects that could act, of which the sets are drawn.
     """

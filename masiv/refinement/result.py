@@ -99,8 +99,8 @@ class RefineResult:
 
     @property
     def verdict(self) -> str:
-        """ "unexplained residual" if so large a residual is improbable with nothing missing, whether an effect was added
-        or not; else "effect added"; "nothing missing" if that is more probable than not, and an effect would more
+        """ "unexplained residual" if so large a residual is improbable with nothing missing, whether an effect was
+        added or not; else "effect added"; "nothing missing" if that is more probable than not, and an effect would more
         probably than not have been seen; else "cannot tell"; "ranked only" if none was fitted."""
         if self.ranked_only:
             return RANKED

@@ -63,9 +63,10 @@ class Round:
 class SearchResult:
     """forward_model: with the observations, as whitened at the end, that all fits are compared with. before: the best
     model without effects. after: with what was accepted, ``before`` itself if nothing was. null_probability: that no
-    effect acts. predictive_p: of a residual as large as that of ``after``, see ``predictive_p``. limits: of effects that
-    were not accepted. discrepancy: ``after`` with a smooth force for what is still unexplained, None if there is no need
-    or no use."""
+    effect acts. predictive_p: of a residual as large as that of ``after``, see ``predictive_p``. limits: of effects
+    that
+    were not accepted. discrepancy: ``after`` with a smooth force for what is still unexplained, None if there is no
+    need or no use."""
 
     forward_model: ForwardModel
     before: ModelFit
@@ -84,8 +85,8 @@ def rank_trials(trials: Sequence[Trial]) -> list[Trial]:
 
 
 def alternatives(name: str, after: ModelFit, rounds: Sequence[Round]) -> dict[str, float]:
-    """Effects that may act in place of the accepted term ``name``, with the probability of the set that has them: of the
-    credible set of the last round that accepted anything."""
+    """Effects that may act in place of the accepted term ``name``, with the probability of the set that has them: of
+    the credible set of the last round that accepted anything."""
     accepting = [r for r in rounds if r.accepted is not None and r.posterior is not None]
     if not accepting or accepting[-1].posterior is None:
         return {}

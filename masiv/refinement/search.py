@@ -110,8 +110,8 @@ def _add_effects(
 
 
 def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperLimit]) -> float:
-    """Probability that no effect acts, effects that were not fitted through the rollout included: their evidence is that
-    of the linear model."""
+    """Probability that no effect acts, effects that were not fitted through the rollout included: their evidence is
+    that of the linear model."""
     fitted = {t.effect for r in rounds for t in r.trials if t.log_bayes_factor is not None}
     once = math.exp(log_prior(1, len(limits)) - log_prior(0, len(limits))) if limits else 0.0
     odds = 1 / null - 1 + sum(once * math.exp(min(x.log_bayes_factor, 700.0)) for x in limits if x.effect not in fitted)
@@ -120,7 +120,8 @@ def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperL
 
 def _rivals(state: SearchState, done: Round) -> list[ModelFit]:
     """What may act in place of what was accepted, with the same law."""
-    assert done.accepted is not None and done.posterior is not None
+    assert done.accepted is not None
+    assert done.posterior is not None
     here = done.accepted.fitted.model
     out = []
     for h in done.posterior.hypotheses:

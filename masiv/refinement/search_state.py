@@ -18,8 +18,8 @@ from masiv.workers import Workers
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """config: see ``RefineConfig``; max_effects, shortlist: its values unless given. rank_only: rank the effects, fit none. discrepancy_force: if much stays unexplained, fit a smooth
-    force for it."""
+    """config: see ``RefineConfig``; max_effects, shortlist: its values unless given. rank_only: rank the effects, fit
+    none. discrepancy_force: if much stays unexplained, fit a smooth force for it."""
 
     config: RefineConfig
     max_effects: int

@@ -33,8 +33,8 @@ SAMPLE = {
     "refine": {
         "processes": 1, "particles": 200, "search_particles": 100, "families": 1, "laws": ["neo_hookean"],
         "effects": ["linear_drag", "body_force", "gravity_scale"], "baseline_rollouts": 6, "shortlist": 2,
-        "max_effects": 1, "tracking_error": 0, "min_explained": 0, "max_null_probability": 0.999999, "min_predictive_p": 0,
-    },
+        "max_effects": 1, "tracking_error": 0, "min_explained": 0, "max_null_probability": 0.999999,
+    "min_predictive_p": 0, },
 }  # fmt: skip
 BAR = {
     "simulator": {"courant_number": 0.6, "max_substeps_per_frame": 4000},

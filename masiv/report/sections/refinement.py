@@ -158,8 +158,8 @@ def _causes(page: Page, candidates: Sequence[Mapping[str, Any]]) -> None:
     )
     page.note(
         "Share of the residual that one effect explains, after initial velocity, stiffness and ground have absorbed "
-        "what they can (score test, first order: a shortlist, the refits decide). Probability: of the model with it, after "
-        "the refits; a dash if it was not fitted."
+        "what they can (score test, first order: a shortlist, the refits decide). Probability: of the model with "
+        "it, after the refits; a dash if it was not fitted."
     )
 
 
