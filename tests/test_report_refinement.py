@@ -87,7 +87,7 @@ def test_numbers_and_pictures_of_an_accepted_effect(tmp_path):
     section = section_of(tmp_path, np.array([0.0, 1.0, 0.0]))
     assert section.count("data:image/png;base64,") == 2
     shown = [
-        "effect added: linear drag",
+        "effect added: one of linear drag, quadratic drag",
         "0.7234",
         "0.0213",
         "81 %",
