@@ -4,13 +4,14 @@
     python benchmarks/refine_calibration.py drag --draws 500 [--first 0]
 
 A ball of 66 mm and 60 g is thrown at 3 to 8 m/s and followed for 40 frames at 60 Hz. Its errors are jitter of 1 mm and
-smooth errors of 0 to 3 times that, with a correlation time between two frames and the record. ``drag``: quadratic, 5e-4 to
-3e-2 /m, evenly in the logarithm. Every draw is searched by ``masiv.refinement.search`` in full.
+smooth errors of 0 to 3 times that, with a correlation time between two frames and the record. ``drag``: quadratic, 5e-4
+to 3e-2 /m, evenly in the logarithm. Every draw is searched by ``masiv.refinement.search`` in full.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import tempfile
@@ -23,6 +24,7 @@ from scipy.stats import beta
 
 FRAMES, FPS, JITTER = 40, 60.0, 1e-3
 MASS, DIAMETER = 0.06, 0.066
+DRAGS = ("quadratic_drag", "linear_drag")
 
 
 def ball_tracks():
@@ -111,31 +113,19 @@ def summary(rows):
         share("verdict nothing missing", sum(r["verdict"] == "nothing missing" for r in rows), len(rows))
         return
     share("named", len(named), len(rows))
-    drags = ("quadratic_drag", "linear_drag")
-    share("wrong name (no drag), of those named", sum(r["named"][0] not in drags for r in named), len(named))
-    share(
-        "true effect in the credible set, of those named",
-        sum("quadratic_drag" in r["credible"] for r in named),
-        len(named),
-    )
+    share("wrong name (no drag), of those named", sum(r["named"][0] not in DRAGS for r in named), len(named))
+    credible = sum("quadratic_drag" in r["credible"] for r in named)
+    share("true effect in the credible set, of those named", credible, len(named))
     known = [r for r in named if "value" in r]
     z = np.array([(r["value"] - r["drag"]) / r["stderr"] for r in known])
     share("within 1 standard error", int((np.abs(z) < 1).sum()), len(z))
     share("within 2 standard errors", int((np.abs(z) < 2).sum()), len(z))
     left = [r for r in rows if "quadratic_drag" in r["limits"] and not r["named"]]
-    share(
-        "below the upper limit, of those not named",
-        sum(r["drag"] <= r["limits"]["quadratic_drag"] for r in left),
-        len(left),
-    )
-    edges = np.geomspace(5e-4, 3e-2, 7)
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    below = sum(r["drag"] <= r["limits"]["quadratic_drag"] for r in left)
+    share("below the upper limit, of those not named", below, len(left))
+    for low, high in itertools.pairwise(np.geomspace(5e-4, 3e-2, 7)):
         own = [r for r in rows if low <= r["drag"] < high]
         share(f"power, drag {low:.1e} to {high:.1e} /m", sum(bool(r["named"]) for r in own), len(own))
-    bins = np.linspace(0, 1, 6)
-    for low, high in zip(bins[:-1], bins[1:], strict=True):
-        own = [r for r in rows if low <= r["null"] <= high]
-        share(f"probability of no effect {low:.1f} to {high:.1f}", 0, len(own))
 
 
 def main():
