@@ -13,6 +13,7 @@ from masiv.inference.error_covariance import BlockCovariance, ErrorBlock
 from masiv.inference.linear_model import LinearModel
 from masiv.inference.marginal_likelihood import Marginal, ParameterPriors, SizePriors, marginal
 from masiv.inference.motion_modes import MotionModes, rotations_since_start
+from masiv.inference.noise_model import OBSERVATION_LIMITED_RATIO
 from masiv.models.base import EffectTerm
 from masiv.models.parameters import Parameter
 from masiv.observations.base import Observation
@@ -25,8 +26,6 @@ MIN_TURNED_POINTS = 4
 """Fewer points do not tell how a body has turned."""
 GRID_CORRELATION = 1 / 3
 """Correlation time of what another grid changes, over the length of the record."""
-OBSERVATION_LIMITED_RATIO = 1.5
-"""``residual_std`` over ``noise_std`` below which an instant is observation-limited."""
 MIN_SEGMENT = 2
 """Instants of a segment, at the least."""
 MIN_SERIES = 0.1

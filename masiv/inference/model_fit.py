@@ -63,10 +63,6 @@ class ModelFit:
         that of the best, since what a model lacks is smooth and makes residuals look fewer than they are."""
         return samples * math.log(max(self.cost, 1e-300)) + len(self.parameters) * math.log(samples)
 
-    def bic_gain(self, other: ModelFit) -> float:
-        """By how much lower the criterion is than that of ``other``, at this fit's number of samples."""
-        return other.bic(self.samples) - self.bic(self.samples)
-
 
 def common_samples(fits: Sequence[ModelFit]) -> int:
     """The number of samples at which fits are compared: that of the fit with the least cost."""

@@ -1,9 +1,8 @@
-"""The noise model of a set of observations: what residuals may be with nothing missing.
+"""Variances of residuals with nothing missing, by which a search whitens and weights them.
 
-Of each observation: ``noise_std`` [m], the measurement; ``residual_std`` (T,) [m], measurement and discretization
-together, by which residuals are whitened; and correlations in space and time, which are estimated from a residual
-(``masiv.inference.smooth_noise``). Two regimes: instants that are *observation-limited*, simulated as well as they are
-observed, and the others.
+Of each observation: ``noise_std`` [m], the measurement, and ``residual_std`` (T,) [m], measurement and discretization
+together. Two regimes: instants that are *observation-limited*, simulated as well as they are observed, and the others.
+What is named is decided with correlated errors (``masiv.inference.evidence``).
 """
 
 from __future__ import annotations
@@ -71,12 +70,6 @@ class NoiseModel:
         """Root mean square residual over ``residual_std``, of the fitted instants of the regime where it is largest:
         about 1 if nothing is missing."""
         return math.sqrt(self.by_regime(self.over_variance(squares)).largest)
-
-    def held_out(self, squares: Sequence[np.ndarray]) -> np.ndarray:
-        """Mean squares over variances at the held-out instants of all observations (H,)."""
-        ratios = zip(self.over_variance(squares), self.observations, strict=True)
-        parts = [ratio[e.fit_count :] for ratio, e in ratios if e.holds_out]
-        return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def observation_limited(observation: Observation) -> np.ndarray:
