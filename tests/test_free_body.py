@@ -24,7 +24,8 @@ def test_a_body_that_ends_somewhere_else_is_followed_from_where_that_shows():
     count = 30
     observation = replace(
         setup.observation, times=np.arange(count) / 24, values=np.zeros((count, 1, 3), np.float32),
-        points=np.zeros((1, 3)), residual_std=np.ones(count), samples_per_frame=2, fit_count=22,
+        points=np.zeros((1, 3)), residual_std=np.ones(count), observation_std=np.ones(count),
+        samples_per_frame=2, fit_count=22,
     )  # fmt: skip
 
     def horizons(errors, flight):

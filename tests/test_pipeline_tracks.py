@@ -43,7 +43,7 @@ def test_an_answer_without_effects_restores_the_identified_twin(run, tmp_path):
     run.refine(RefineRequest(group=True))
     assert effects(run) != identified
     settings = tmp_path / "settings.yaml"
-    settings.write_text(yaml.safe_dump({"refine": {"effects": ["swirl"]}}))
+    settings.write_text(yaml.safe_dump({"refine": {"effects": ["swirl"], "min_predictive_p": 0}}))
     other = masiv.reopen_run(run.path, Overrides(config=settings))
     assert not other.refine(RefineRequest(group=True)).data["accepted"]
     assert effects(run) == identified

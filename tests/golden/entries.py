@@ -311,6 +311,8 @@ def refined(found: dict[str, Any]) -> Numbers:
     of_tracks = found["condition"] is not None or bool(found["bodies"])
     return {
         "verdict": found["verdict"],
+        "null_probability": found["null_probability"],
+        "predictive_p": [found["predictive_p"]["before"], found["predictive_p"]["after"]],
         "laws": [found["laws"]["before"], found["laws"]["after"]],
         "law": parameters(found["law_parameters"]) if of_tracks else {},
         "noise_mm": found["noise_floor_mm"],
@@ -323,7 +325,7 @@ def refined(found: dict[str, Any]) -> Numbers:
                 "scope": c.get("scope", "all"),
                 "explained": c["explained"],
                 "strength": [c["theta"], c["stderr"]],
-                "alike": c["confusable_with"],
+                "probability": c["probability"],
             }
             for c in found["candidates"]
         ],
@@ -336,9 +338,9 @@ def refined(found: dict[str, Any]) -> Numbers:
                         "effect": t["effect"],
                         "scope": t.get("scope", "all"),
                         "rmse_mm": [t["fit_rmse_mm"], t["held_out_rmse_mm"]],
-                        "gain": t["information_gain"],
+                        "log_bayes_factor": t["log_bayes_factor"],
                         "accepted": t["accepted"],
-                        "objections": len(t["objections"]),
+                        "impossible": len(t["impossible"]),
                     }
                     for t in r["refits"]
                 ],
@@ -351,7 +353,6 @@ def refined(found: dict[str, Any]) -> Numbers:
                 "bodies": a.get("bodies", []),
                 "values": list(a["theta"].values()),
                 "stderr": list(a["stderr"].values()),
-                "alike": a["confusable_with"],
                 "instead": a["indistinguishable_from"],
             }
             for a in found["accepted"]
