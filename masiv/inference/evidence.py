@@ -112,8 +112,8 @@ class _Segment:
 
 def _weights(residuals: Sequence[np.ndarray], *, together: bool) -> tuple[float, ...]:
     """Powers of the likelihoods of groups whose ``residuals`` are (T, K_g): the part of their series that is
-    independent
-    of others in the group; ``together``: and of the groups before, the first of which is the mean motion."""
+    independent of others in the group; ``together``: and of the groups before, the first of which is the mean
+    motion."""
     series = [independent_series(r) for r in residuals]
     if together:
         known = 0.0

@@ -22,9 +22,9 @@ DRAWS = 2000
 @dataclass(frozen=True)
 class UpperLimit:
     """strength: 95 % upper limit of the size of an effect's strength, in its unit. motion_mm: root mean square change
-    of
-    the observed motion that it makes at that limit. determined: whether the limit is below the middle of the sizes that
-    are likely beforehand: if not, the recording says little of the effect. log_bayes_factor: for the effect, linear."""
+    of the observed motion that it makes at that limit. determined: whether the limit is below the middle of the sizes
+    that are likely beforehand: if not, the recording says little of the effect. log_bayes_factor: for the effect, of
+    the linear model."""
 
     effect: str
     strength: float

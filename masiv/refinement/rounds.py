@@ -64,9 +64,8 @@ class SearchResult:
     """forward_model: with the observations, as whitened at the end, that all fits are compared with. before: the best
     model without effects. after: with what was accepted, ``before`` itself if nothing was. null_probability: that no
     effect acts. predictive_p: of a residual as large as that of ``after``, see ``predictive_p``. limits: of effects
-    that
-    were not accepted. discrepancy: ``after`` with a smooth force for what is still unexplained, None if there is no
-    need or no use."""
+    that were not accepted. discrepancy: ``after`` with a smooth force for what is still unexplained, None if there is
+    no need or no use."""
 
     forward_model: ForwardModel
     before: ModelFit

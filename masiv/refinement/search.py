@@ -114,7 +114,11 @@ def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperL
     that of the linear model."""
     fitted = {t.effect for r in rounds for t in r.trials if t.log_bayes_factor is not None}
     once = math.exp(log_prior(1, len(limits)) - log_prior(0, len(limits))) if limits else 0.0
-    odds = 1 / null - 1 + sum(once * math.exp(min(x.log_bayes_factor, 700.0)) for x in limits if x.effect not in fitted)
+    odds = (
+        1 / max(null, 1e-300)
+        - 1
+        + sum(once * math.exp(min(x.log_bayes_factor, 700.0)) for x in limits if x.effect not in fitted)
+    )
     return 1 / (1 + odds)
 
 
