@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from masiv.errors import NonFiniteError
+from masiv.inference.least_squares import derivative
 from masiv.models.base import ForwardModel, Model
 from masiv.models.parameters import Parameter
 
@@ -37,27 +37,14 @@ def linear_model(
 ) -> LinearModel:
     """``model`` about ``values``: one rollout over all instants, and one a parameter. Raises NonFiniteError."""
     here = forward_model.fields(model, values, held_out=True)
-    columns = [_derivative(forward_model, model, values, here, p) for p in parameters]
-    jacobians = [
-        np.stack([c[k] for c in columns], axis=-1) if columns else np.zeros((*f.shape, 0)) for k, f in enumerate(here)
-    ]
+
+    def flat(values: dict[str, float]) -> np.ndarray:
+        return np.concatenate([f.ravel() for f in forward_model.fields(model, values, held_out=True)])
+
+    together = np.concatenate([f.ravel() for f in here])
+    columns = [derivative(flat, values, together, p) for p in parameters]
+    joined = np.stack(columns, axis=1) if columns else np.zeros((len(together), 0))
+    parts = np.split(joined, np.cumsum([f.size for f in here])[:-1])
+    jacobians = [part.reshape(*f.shape, len(columns)) for part, f in zip(parts, here, strict=True)]
     nuisance = [forward_model.nuisance(model, values, k) for k in range(len(here))]
     return LinearModel(model, dict(values), tuple(parameters), here, jacobians, nuisance)
-
-
-def _derivative(
-    forward_model: ForwardModel, model: Model, values: Mapping[str, float], here: list[np.ndarray], p: Parameter
-) -> list[np.ndarray]:
-    centre = p.fitted(values[p.name])
-    sides = [1.0, -1.0] if centre + p.step <= p.fitted(p.upper) else [-1.0, 1.0]
-    for side in sides:
-        shifted = {**values, p.name: p.value(centre + side * p.step)}
-        actual = p.fitted(shifted[p.name]) - centre
-        if actual == 0:
-            continue
-        try:
-            there = forward_model.fields(model, shifted, held_out=True)
-        except NonFiniteError:
-            continue
-        return [(a - b) / actual for a, b in zip(there, here, strict=True)]
-    raise NonFiniteError(0, 0, f"the simulation diverges on both sides of {p.name} = {values[p.name]:.4g}")

@@ -53,7 +53,6 @@ class Marginal:
     covariance: np.ndarray
     weights: np.ndarray
     sizes: ErrorSizes
-    log_sizes: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -204,7 +203,6 @@ def marginal(blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizeP
     spread = np.tensordot(weights, terms.covariance + apart[:, :, None] * apart[:, None, :], 1)
     return Marginal(
         -float(found.fun) + float(volume), priors.mean + mean, spread, weights, ErrorSizes.of_logarithms(found.x),
-        found.x,
     )  # fmt: skip
 
 
