@@ -74,7 +74,7 @@ def observed(case: Case) -> tuple[Scene, SampledMotion]:
     active = ActiveEffects(tuple(members), setting)
     needed = substeps_per_frame(
         spacing=spacing, wave_modulus=law.wave_modulus(), density=1000.0, speed=5.0, frame_time=1 / FPS,
-        config=SimulatorConfig(max_substeps_per_frame=1 << 16), demand=active.substep_demand(),
+        config=SimulatorConfig.model_validate({"max_substeps_per_frame": 1 << 16}), demand=active.substep_demand(),
     )  # fmt: skip
     steps = -(-needed // 8) * 8
     simulator = Simulator(particle_count=count, spacing=spacing, substep=1 / (FPS * steps), volume=body.volume,
