@@ -19,6 +19,8 @@ from masiv.effects.catalogue import effect_named
 from masiv.effects.context import EffectContext
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.initial_state import rigid_initial_state
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.design import substeps_per_frame
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.observations.motion import SampledMotion
@@ -60,9 +62,6 @@ def observed(case: Case) -> tuple[Scene, SampledMotion]:
     law = ClassicalLaw(case.law, **case.parameters)
     count = len(start)
     spacing = (case.per_cell * body.volume / count) ** (1 / 3)
-    steps = 8 * int(np.ceil(((2 * law.wave_modulus() / 1000) ** 0.5 + 5) / (0.3 * spacing * FPS) / 8))
-    simulator = Simulator(particle_count=count, spacing=spacing, substep=1 / (FPS * steps), volume=body.volume,
-                          density=1000.0, gravity=(0.0, -9.8, 0.0), contact=case.contact, max_substeps=512)  # fmt: skip
     size = float((start - start.mean(0)).norm(dim=1).quantile(0.9)) * 2
     setting = EffectContext(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * body.volume / count, size, case.frames / FPS)
     members, late = [], 0.0
@@ -73,6 +72,13 @@ def observed(case: Case) -> tuple[Scene, SampledMotion]:
         effect = UNKNOWN[name]
         members.append((effect, torch.tensor([values[p.name] for p in effect.parameters])))
     active = ActiveEffects(tuple(members), setting)
+    needed = substeps_per_frame(
+        spacing=spacing, wave_modulus=law.wave_modulus(), density=1000.0, speed=5.0, frame_time=1 / FPS,
+        config=SimulatorConfig.model_validate({"max_substeps_per_frame": 1 << 16}), demand=active.substep_demand(),
+    )  # fmt: skip
+    steps = -(-needed // 8) * 8
+    simulator = Simulator(particle_count=count, spacing=spacing, substep=1 / (FPS * steps), volume=body.volume,
+                          density=1000.0, gravity=(0.0, -9.8, 0.0), contact=case.contact, max_substeps=512)  # fmt: skip
     raised, late = float(active.ground_shift()), round(float(active.time_shift()) * FPS * steps)
     shift = torch.tensor([0.0, raised, 0.0])
     state = rigid_initial_state(start - shift, torch.tensor(case.velocity), torch.tensor(case.omega))

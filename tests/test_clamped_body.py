@@ -124,3 +124,25 @@ def test_what_was_not_measured_leaves_no_residual(bar):
     expected = np.ones_like(field)
     expected[2, 1, 0] = 0.0
     np.testing.assert_allclose(field, expected, rtol=0, atol=1e-12)
+
+
+def test_effects_divide_the_substep_of_the_law_if_they_are_strong(bar):
+    forward_model = model_of(bar, None)
+    (run,) = forward_model.observations
+    times = np.linspace(0, 0.05, 21)
+    viscous = MODEL.with_effect("viscosity")
+
+    def substep(strength, at=None):
+        model = forward_model if at is None else forward_model.held_at({"viscosity.viscosity": at})
+        return model.substep(run, viscous, {"viscosity.viscosity": strength}, times)
+
+    held = forward_model.substep(run, MODEL, {}, times)
+    body, law = forward_model.body(run), forward_model.law(MODEL, {})
+    weakest = next(s for s in np.geomspace(0.1, 500, 100) if substep(s) < held)
+    assert substep(0.1) == held
+    assert held / substep(weakest) == 2.0
+    assert substep(0.99 * weakest, at=weakest) == substep(weakest) == substep(weakest, at=weakest)
+    acting = forward_model.acting(run, viscous, {"viscosity.viscosity": 500.0}, 0.05)
+    assert substep(500.0) <= body.substep(law, times, acting) < held
+    with pytest.raises(NonFiniteError, match="the law with its effects needs substeps"):
+        substep(500.0, at=0.1)

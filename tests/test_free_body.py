@@ -8,14 +8,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from flight import VELOCITY, small_simulation
+from scipy.optimize import brentq
 
-from masiv.errors import MasivError
+from masiv.effects.catalogue import effect_named
+from masiv.errors import MasivError, NonFiniteError
 from masiv.inference.least_squares import derivative
 from masiv.inference.model_fit import residual_of
+from masiv.materials.classical import ClassicalLaw
 from masiv.models.base import Model
-from masiv.models.families import FAMILIES
+from masiv.models.families import FAMILIES, law_of
 from masiv.models.free_body import FreeBodyModel
+from masiv.mpm.design import HELD_MARGIN
 
 
 @pytest.mark.usefixtures("taichi")
@@ -73,6 +78,84 @@ def test_a_law_that_few_particles_can_take_finer_grids_can_take_too():
     stiffest = max(filter(possible, np.geomspace(1e3, 1e8, 200)))
     needed = [finer.min_substeps(law(stiffest)) for finer in setup.finer]
     assert max(needed) > setup.body.body.config.max_substeps_per_frame
+
+
+def viscous(body, strength):
+    return body.body.effects([(effect_named("viscosity"), torch.tensor([strength]))], body.context())
+
+
+@pytest.mark.usefixtures("taichi")
+def test_an_effect_that_few_particles_can_take_finer_grids_can_take_too():
+    (setup,) = small_simulation()[0].setups
+    law = ClassicalLaw("neo_hookean", youngs_modulus=1e4, poissons_ratio=0.3)
+
+    def possible(strength):
+        try:
+            return setup.body.min_substeps(law, viscous(setup.body, strength)) > 0
+        except MasivError:
+            return False
+
+    strongest = max(filter(possible, np.geomspace(1.0, 1e6, 200)))
+    assert (
+        setup.body.min_substeps(law, viscous(setup.body, strongest))
+        > 0.9 * setup.body.body.config.max_substeps_per_frame
+    )
+    for finer in setup.finer:
+        assert finer.min_substeps(law, viscous(finer, strongest)) > 0
+
+
+def viscous_model(strength):
+    """A model of the small simulation whose ``strength`` of viscosity is a multiple of the greatest that it can take
+    with the substeps of its law alone."""
+    simulation, _ = small_simulation()
+    (setup,) = simulation.setups
+    model = Model(FAMILIES["neo_hookean"], "sticky").with_effect("viscosity")
+    values = {p.name: p.start for p in simulation.parameters(model)}
+    law = law_of(model.family, values)
+    held = setup.body.held_substeps(law, simulation.held, (0, "neo_hookean"))
+
+    def needed(eta):
+        return setup.body.min_substeps(law, viscous(setup.body, eta))
+
+    last = brentq(lambda eta: needed(eta) - HELD_MARGIN * held, 1.0, 6e3, xtol=0.1)
+    return simulation, model, {**values, "viscosity.viscosity": strength * last}, (setup.body, law, held)
+
+
+@pytest.mark.usefixtures("taichi")
+def test_substeps_are_those_of_the_law_while_an_effect_is_weak():
+    counts = []
+    for strength in (0.01, 0.98, 1.02, 1.4, 1.5):
+        _, _, values, (body, law, held) = viscous_model(strength)
+        effects = viscous(body, values["viscosity.viscosity"])
+        counts.append(body.substeps_with(held, law, effects) / held)
+        assert body.substeps_with(held, law, effects) * HELD_MARGIN >= body.min_substeps(law, effects)
+    assert counts == [1, 1, 2, 2, 4]
+
+
+@pytest.mark.usefixtures("taichi")
+def test_derivatives_are_taken_with_the_substeps_of_their_point():
+    """Where substeps are doubled the motion jumps, its derivative does not."""
+    simulation, model, values, _ = viscous_model(0.99)
+    eta = values["viscosity.viscosity"]
+    here, above = simulation.residual(model, values), {**values, "viscosity.viscosity": 1.01 / 0.99 * eta}
+    fixed = simulation.held_at(values)
+    np.testing.assert_array_equal(fixed.residual(model, values), here)
+    with pytest.raises(NonFiniteError, match="needs substeps of"):
+        fixed.residual(model, above)
+    jump = np.abs(simulation.residual(model, above) - here).max()
+    known = next(p for p in simulation.parameters(model) if p.name == "viscosity.viscosity")
+    step = replace(known, step=0.01 / 0.99 * eta, upper=10 * eta)
+    slope = derivative(residual_of(simulation, model), values, here, step)
+    smooth = (here - simulation.residual(model, {**values, "viscosity.viscosity": 0.95 * eta})) / (0.05 * eta)
+    np.testing.assert_allclose(slope, smooth, rtol=0, atol=0.1 * np.abs(smooth).max())
+    assert jump / step.step > 3 * np.abs(smooth).max()
+
+
+@pytest.mark.usefixtures("taichi")
+def test_an_effect_that_needs_too_many_substeps_is_named():
+    simulation, model, values, _ = viscous_model(1.0)
+    with pytest.raises(NonFiniteError, match="viscosity as strong as this"):
+        simulation.residual(model, {**values, "viscosity.viscosity": 1e6})
 
 
 @pytest.mark.usefixtures("taichi")

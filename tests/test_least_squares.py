@@ -235,3 +235,29 @@ def test_the_two_robust_costs_differ_in_scale_alone():
         assert soft_l1_mean_square(residual, scale) == pytest.approx(2 * scale**2 * per_sample)
     assert soft_l1_mean_square(residual, 1.0) == pytest.approx(float((residual**2).mean()), rel=1e-4)
     assert soft_l1_sum(residual, math.inf) == pytest.approx(float(residual @ residual))
+
+
+class Jumping:
+    """The square of x, one more from x = 1 on: as a simulation that takes more substeps there."""
+
+    def __init__(self, at=None):
+        self.at = at
+
+    def __call__(self, values):
+        x = values["x"]
+        return np.array([x**2 - 4.0 + ((x if self.at is None else self.at) >= 1.0)])
+
+    def held_at(self, values):
+        return Jumping(values["x"])
+
+
+def test_a_jump_is_not_mistaken_for_a_derivative():
+    x = Parameter("x", 0.99, -10, 10, 0.02)
+    residual = Jumping()
+    here = residual({"x": 0.99})
+    assert derivative(residual, {"x": 0.99}, here, x) == pytest.approx([2 * 0.99 + 0.02])
+    assert derivative(Jumping().__call__, {"x": 0.99}, here, x) == pytest.approx([2 * 0.99 + 0.02 + 50])
+    found = gauss_newton(residual, [x], max_evaluations=100)
+    assert found.values["x"] == pytest.approx(math.sqrt(3.0), abs=1e-3)
+    only = gauss_newton(residual, [x], max_evaluations=2)
+    assert only.jacobian == pytest.approx(np.array([[2 * 0.99 + 0.02]]))

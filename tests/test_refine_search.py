@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from linear_model import EFFECTS, NOISE, ONES, POINTS, TIMES, LinearModel, baseline, pattern
 
-from masiv.errors import InputError, MasivError
+from masiv.errors import InputError, MasivError, NonFiniteError
+from masiv.inference.noise_model import NoiseModel
 from masiv.models.families import Family
 from masiv.refinement.candidates import score
 from masiv.refinement.config import RefineConfig
 from masiv.refinement.document import document, text
 from masiv.refinement.effect_fit import fit_with_effect
 from masiv.refinement.rounds import Trial
-from masiv.refinement.search import DISCREPANCY_FORCE
+from masiv.refinement.search import DISCREPANCY_FORCE, whitened_start
 from masiv.refinement.search_round import could_improve
 from masiv.refinement.search_state import SearchSettings
 from masiv.refinement.stage import refine
@@ -112,6 +113,11 @@ def test_what_diverges_is_listed_with_its_reason():
     assert [(r["effect"], "flew apart" in r["reason"]) for r in written["not_ranked"]] == [("viscosity", True)]
     assert "viscosity" not in {c["effect"] for c in written["candidates"]}
     assert "not ranked: it flew apart" in text(written)
+    limits = {x["effect"]: x for x in written["upper_limits"]}
+    assert not limits["viscosity"]["determined"]
+    assert "both sides of viscosity.strength" in limits["viscosity"]["reason"]
+    assert "no upper limit of viscosity: " in text(written)
+    assert all(x["reason"] is None for name, x in limits.items() if name != "viscosity")
 
 
 class Brittle(LinearModel):
@@ -120,8 +126,6 @@ class Brittle(LinearModel):
     def fields(self, model, values, *, held_out=False):
         strength = values.get("body_force.strength", 0.0)
         if strength not in (0.0, 0.01):
-            from masiv.errors import NonFiniteError
-
             raise NonFiniteError(5, 6, "it broke")
         return super().fields(model, values, held_out=held_out)
 
@@ -132,6 +136,65 @@ def test_a_refit_that_cannot_be_simulated_is_listed_with_its_reason():
     assert done["refits"] == []
     assert [(f["effect"], f["law"]) for f in done["not_fitted"]] == [("body_force", "rigid")]
     assert "diverges" in done["not_fitted"][0]["reason"] or "it broke" in done["not_fitted"][0]["reason"]
+
+
+class NoDerivatives(LinearModel):
+    """A motion over all instants that can be simulated where a fit ends and nowhere near: for models with an effect, or
+    for those without."""
+
+    with_effect = True
+    last: dict | None = None
+
+    def fields(self, model, values, *, held_out=False):
+        if held_out and bool(model.effects) == self.with_effect:
+            if self.last is not None and self.last.keys() == values.keys():
+                moved = max(abs(self.last[n] - values[n]) for n in values)
+                if abs(moved - 0.01) < 1e-9:  # the step of a finite difference
+                    raise NonFiniteError(5, 6, "it broke")
+            self.last = dict(values)
+        return super().fields(model, values, held_out=held_out)
+
+
+def test_a_model_without_derivatives_is_listed_with_its_reason_and_not_accepted():
+    result = refined(NoDerivatives({"body_force.strength": 0.3, "velocity_z": 0.3}), {"effects": ["body_force"]})
+    assert result.accepted == ()
+    written = document(result)
+    (refit,) = written["rounds"][0]["refits"]
+    assert "diverges on both sides of velocity_z" in refit["not_weighed"]
+    assert "not weighed: " in text(written)
+
+
+def test_nothing_is_accepted_if_there_is_nothing_to_compare_it_with():
+    model = NoDerivatives({"body_force.strength": 0.3, "velocity_z": 0.3})
+    model.with_effect = False
+    with pytest.raises(MasivError, match=r"no model without a further effect can be weighed.*velocity_z"):
+        refined(model, {"effects": ["body_force"]})
+
+
+def test_noise_is_no_outlier_in_any_observation():
+    """Whitened residuals of an observation have its own noise."""
+    model = LinearModel({"velocity_z": 0.3})
+    (quiet,) = model.observations
+    (loud,) = LinearModel({"velocity_z": 0.3}, noise=20 * NOISE, name="b").observations
+    loud = replace(loud, noise_std=20 * NOISE, residual_std=20 * quiet.residual_std, observation_std=np.zeros(0))
+    scales = []
+    for observations in ([quiet, loud], [loud, quiet]):
+        both = model.with_observations(observations)
+        scales.append(whitened_start(both, [baseline(both)], settings())[0].robust_scale)
+    assert scales[0] == scales[1] >= 5 * 20 * NOISE
+
+
+def test_the_model_before_is_judged_by_the_errors_of_its_own_motion():
+    """Also if a further effect was looked for after the first, and rejected."""
+    kind = type("Changing", (Grids,), {"factor": 10.0})
+    result = refined(kind({**DRAG}))
+    assert [t.name for t in result.accepted] == ["linear_drag"]
+    assert result.search.rounds[-1].accepted is None
+    alone = refined(kind({**DRAG}), rank_only=True)
+    assert result.before.fit_mm == pytest.approx(alone.before.fit_mm)
+    assert result.reduced_chi(result.before) == pytest.approx(alone.reduced_chi(alone.before), rel=1e-6)
+    in_the_end = NoiseModel(result.observations).reduced_chi(result.before.squares)
+    assert in_the_end != pytest.approx(result.reduced_chi(result.before), rel=0.05)
 
 
 def test_ranking_alone_fits_and_changes_nothing():

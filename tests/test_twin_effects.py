@@ -18,7 +18,7 @@ from tiny_scenes import springgaus_synthetic
 from masiv.cli import main
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effect_named
-from masiv.errors import InputError
+from masiv.errors import InputError, MasivError
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, rigid_initial_state
@@ -84,6 +84,18 @@ def test_without_effects_every_bit_is_that_of_bare_rollouts():
         bare.append(state.position)
     np.testing.assert_array_equal(simulate(body, frames=frames).positions, torch.stack(bare).numpy())
     np.testing.assert_array_equal(torch.stack([s.position for s in iterate_states(body, frames=frames, fps=FPS)]), bare)
+
+
+def test_a_strong_viscosity_takes_more_substeps():
+    """With those of the law alone its flight would not stay rigid."""
+    strong = TwinEffect("viscosity", {"viscosity": 3000.0})
+    moved = simulate(flying(strong), frames=4).positions
+    sizes = np.linalg.norm(moved - moved.mean(1, keepdims=True), axis=2)
+    np.testing.assert_allclose(sizes[-1], sizes[0], rtol=0.05)
+    few = CONFIG.model_copy(update={"max_substeps_per_frame": 40})
+    assert simulate(flying(simulator=few), frames=2).positions.shape[0] == 2
+    with pytest.raises(MasivError, match="viscosity as strong as this"):
+        simulate(flying(strong, simulator=few), frames=2)
 
 
 def test_drag_in_free_flight_ends_at_its_terminal_velocity():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
@@ -20,6 +20,7 @@ from masiv.effects.effect import (
     NodalEffect,
     StressEffect,
 )
+from masiv.effects.stability import SubstepDemand
 from masiv.errors import InputError
 
 E = TypeVar("E", bound=Effect)
@@ -58,6 +59,15 @@ class ActiveEffects:
     def coefficients(self) -> list[torch.Tensor]:
         """Coefficients of ``kernel_members``, differentiable: (K,) for one on the grid, (N, K) on the stress."""
         return [effect.coefficients(theta, self.context) for effect, theta in self.kernel_members]
+
+    @torch.no_grad()
+    def substep_demand(self) -> SubstepDemand:
+        """What all of them ask of the substep in addition to the law."""
+        total = nothing = SubstepDemand()
+        for effect, theta in self.of_kind(StressEffect):
+            own = effect.substep_demand(theta, self.context)
+            total = total.then(own if own == nothing else replace(own, effects=(effect.name,)))
+        return total
 
     def mass_factor(self) -> torch.Tensor | None:
         """Product (N,) of the factors of mass; None if no effect has one."""

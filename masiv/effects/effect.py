@@ -23,6 +23,7 @@ import torch
 from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.per_body import PerBody
 from masiv.effects.search_hints import SearchHints
+from masiv.effects.stability import SubstepDemand
 
 
 class Effect(ABC):
@@ -89,6 +90,10 @@ class StressEffect(Effect):
     def coefficients(self, theta: torch.Tensor, context: EffectContext) -> torch.Tensor:
         """Parameters (P,) -> coefficients (N, K) of the particles; differentiable."""
         return theta.expand(len(context.rest), -1)
+
+    def substep_demand(self, theta: torch.Tensor, context: EffectContext) -> SubstepDemand:
+        """What parameters (P,) ask of the substep in addition to the law; nothing if not given."""
+        return SubstepDemand()
 
 
 class MassEffect(Effect):

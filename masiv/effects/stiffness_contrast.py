@@ -1,5 +1,7 @@
 """A part that is stiffer or softer than the rest."""
 
+import math
+
 import taichi as ti
 import torch
 
@@ -7,6 +9,7 @@ from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.effect import StressEffect
 from masiv.effects.places import PLACE, as_guesses, cluster_centres, square_distance
 from masiv.effects.search_hints import SearchHints
+from masiv.effects.stability import SubstepDemand
 
 
 @ti.func
@@ -40,3 +43,8 @@ class StiffnessContrast(StressEffect):
     def coefficients(self, theta, context):
         bump = torch.exp(-0.5 * square_distance(context.rest, theta[1:4]) / theta[4] ** 2)
         return (theta[0] * bump)[:, None]
+
+    def substep_demand(self, theta, context):
+        # At the stiffest particle; around a softer part the body is as the law has it.
+        stiffest = float(self.coefficients(theta, context).max())
+        return SubstepDemand(modulus_factor=math.exp(max(stiffest, 0.0)))

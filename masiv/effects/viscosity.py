@@ -4,6 +4,7 @@ import taichi as ti
 
 from masiv.effects.context import EffectParameter
 from masiv.effects.effect import StressEffect
+from masiv.effects.stability import SubstepDemand
 from masiv.kernels.tensor import deviator
 
 
@@ -25,3 +26,6 @@ class Viscosity(StressEffect):
 
     def particle_stress(self):
         return _viscous
+
+    def substep_demand(self, theta, context):
+        return SubstepDemand(viscosity=float(theta[0]))

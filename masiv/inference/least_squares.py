@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -22,6 +22,19 @@ from masiv.models.parameters import Parameter
 
 Residual = Callable[[dict[str, float]], np.ndarray]
 """Values by name -> residual (M,). Raises NonFiniteError if the simulation diverges."""
+
+
+@runtime_checkable
+class HeldResidual(Protocol):
+    """A residual that jumps at some values, such as those at which a simulation takes more substeps."""
+
+    def __call__(self, values: dict[str, float]) -> np.ndarray: ...
+
+    def held_at(self, values: Mapping[str, float]) -> Residual:
+        """The same residual at ``values``, and smooth about them: for finite differences."""
+        ...
+
+
 FIRST_STEP = 10.0
 """Radius of the first trust region, and longest step of ``broyden``, in finite-difference steps."""
 STEP_TOLERANCE = 1e-3
@@ -62,6 +75,7 @@ def free_parameters(parameters: Sequence[Parameter], values: Mapping[str, float]
 def derivative(residual: Residual, values: Mapping[str, float], here: np.ndarray, p: Parameter) -> np.ndarray:
     """Derivative (M,) of the residual, which is ``here`` (M,) at ``values``, with respect to ``p`` in its fitted scale:
     a finite difference within the bounds. Raises NonFiniteError if the simulation diverges on both sides."""
+    near = _held_at(residual, values)
     centre = p.fitted(values[p.name])
     sides = [1.0, -1.0] if centre + p.step <= p.fitted(p.upper) else [-1.0, 1.0]
     for side in sides:
@@ -70,10 +84,14 @@ def derivative(residual: Residual, values: Mapping[str, float], here: np.ndarray
         if actual == 0:
             continue
         try:
-            return (residual(shifted) - here) / actual
+            return (near(shifted) - here) / actual
         except NonFiniteError:
             continue
     raise NonFiniteError(0, 0, f"the simulation diverges on both sides of {p.name} = {values[p.name]:.4g}")
+
+
+def _held_at(residual: Residual, values: Mapping[str, float]) -> Residual:
+    return residual.held_at(values) if isinstance(residual, HeldResidual) else residual
 
 
 # -- Gauss-Newton with fresh derivatives -----------------------------------------------------------------------------
@@ -128,9 +146,9 @@ class _Evaluator:
         fitted = self.start + self.scale * u
         return {p.name: p.value(x) for p, x in zip(self.parameters, fitted, strict=True)}
 
-    def call(self, u: np.ndarray) -> np.ndarray:
+    def call(self, residual: Residual, u: np.ndarray) -> np.ndarray:
         self.count += 1
-        out = np.asarray(self.residual(self.values(u)), dtype=np.float64).ravel()
+        out = np.asarray(residual(self.values(u)), dtype=np.float64).ravel()
         if not np.isfinite(out).all():
             raise NonFiniteError(0, 0, "a residual is not finite")
         return out
@@ -142,7 +160,7 @@ class _Evaluator:
         if self.best is not None and self.count + 1 + len(self.parameters) > self.max_evaluations:
             raise _Spent
         try:
-            out = self.call(u)
+            out = self.call(self.residual, u)
         except NonFiniteError:
             if self.best is None:
                 raise
@@ -155,6 +173,7 @@ class _Evaluator:
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """Forward differences, backward if forward leaves the bounds or diverges; (M, P) per unit of u."""
         base = self.trial(u)
+        near = _held_at(self.residual, self.values(u))
         columns = []
         for k, p in enumerate(self.parameters):
             fitted = self.start[k] + self.scale[k] * u[k]
@@ -163,7 +182,7 @@ class _Evaluator:
                 shifted = u.copy()
                 shifted[k] += side / FIRST_STEP
                 try:
-                    columns.append((self.call(shifted) - base) * (FIRST_STEP * side))
+                    columns.append((self.call(near, shifted) - base) * (FIRST_STEP * side))
                     break
                 except NonFiniteError:
                     continue

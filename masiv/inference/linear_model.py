@@ -37,9 +37,10 @@ def linear_model(
 ) -> LinearModel:
     """``model`` about ``values``: one rollout over all instants, and one a parameter. Raises NonFiniteError."""
     here = forward_model.fields(model, values, held_out=True)
+    near = forward_model.held_at(values)
 
     def flat(values: dict[str, float]) -> np.ndarray:
-        return np.concatenate([f.ravel() for f in forward_model.fields(model, values, held_out=True)])
+        return np.concatenate([f.ravel() for f in near.fields(model, values, held_out=True)])
 
     together = np.concatenate([f.ravel() for f in here])
     columns = [derivative(flat, values, together, p) for p in parameters]

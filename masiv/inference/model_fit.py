@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -85,9 +84,25 @@ def split_fields(
     return fit, [f[e.fit_count :] for f, e in zip(fields, observations, strict=True) if e.holds_out]
 
 
+@dataclass(frozen=True)
+class ModelResidual:
+    """The whitened residual (M,) [m] of ``model`` as a function of its values, but for those that are ``fixed``."""
+
+    forward_model: ForwardModel
+    model: Model
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+    def __call__(self, values: Mapping[str, float]) -> np.ndarray:
+        return self.forward_model.residual(self.model, {**self.fixed, **values})
+
+    def held_at(self, values: Mapping[str, float]) -> ModelResidual:
+        """See ``HeldResidual``."""
+        return replace(self, forward_model=self.forward_model.held_at({**self.fixed, **values}))
+
+
 def residual_of(forward_model: ForwardModel, model: Model) -> Residual:
-    """The whitened residual of ``model`` as a function of its values."""
-    return functools.partial(forward_model.residual, model)
+    """See ``ModelResidual``."""
+    return ModelResidual(forward_model, model)
 
 
 def held_parameters(forward_model: ForwardModel, fitted: ModelFit) -> frozenset[str]:
@@ -130,15 +145,13 @@ def gauss_newton_fit(
     held: names of parameters that stay as they are. Raises NonFiniteError and MasivError, see ``gauss_newton``."""
     parameters = with_start_values([p for p in forward_model.parameters(model) if p.name not in held], values)
     fixed = {name: values[name] for name in held}
-    residual = residual_of(forward_model, model)
+    residual = ModelResidual(forward_model, model, fixed)
     if not parameters:
-        here = residual(fixed)
+        here = residual({})
         empty = np.zeros((len(here), 0))
         scale = robust_scale or robust_scale_of(here)
         return evaluate_fit(forward_model, model, parameters, fixed, empty, robust_scale=scale)
-    estimate = gauss_newton(
-        lambda v: residual({**fixed, **v}), parameters, max_evaluations=budget, robust=True, tolerance=MIN_DECREASE
-    )
+    estimate = gauss_newton(residual, parameters, max_evaluations=budget, robust=True, tolerance=MIN_DECREASE)
     return evaluate_fit(
         forward_model, model, parameters, {**fixed, **estimate.values}, estimate.jacobian,
         robust_scale=robust_scale or robust_scale_of(estimate.residual),

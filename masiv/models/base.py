@@ -127,6 +127,11 @@ class ForwardModel(ABC):
         out.observations = tuple(observations)
         return out
 
+    def held_at(self: Self, values: Mapping[str, float]) -> Self:
+        """A copy for finite differences about ``values``: what depends on the values and is not smooth in them, such as
+        a number of substeps, is as at ``values``. It shares with this one what a copy with other observations does."""
+        return self
+
     @abstractmethod
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
         """Everything that is fitted: law, effects, and what belongs to each recording."""

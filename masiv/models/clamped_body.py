@@ -7,6 +7,7 @@ out.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,8 +24,8 @@ from masiv.effects.per_body import DragBody
 from masiv.materials.classical import UNITS, ClassicalLaw
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model
 from masiv.models.cache import Arrays, RolloutCache
-from masiv.models.deformable import HeldSubsteps, failures_as_divergence
-from masiv.models.marked_body import MarkedBody, marked_body
+from masiv.models.deformable import HeldSubsteps, check_substep, failures_as_divergence, halved
+from masiv.models.marked_body import MarkedBody, marked_body, mean_interval
 from masiv.models.parameters import Parameter
 from masiv.models.release import fit_release
 from masiv.mpm.config import SimulatorConfig
@@ -73,6 +74,7 @@ class ClampedBodyModel(ForwardModel):
     """
 
     observations: Sequence[TracksObservation]
+    _held_values: Mapping[str, float] | None = None
 
     def __init__(
         self,
@@ -202,11 +204,28 @@ class ClampedBodyModel(ForwardModel):
 
     # -- motion -------------------------------------------------------------------------------------------------
 
+    def held_at(self, values: Mapping[str, float]) -> ClampedBodyModel:
+        """See ``ForwardModel``."""
+        out = copy.copy(self)
+        out._held_values = dict(values)
+        return out
+
     def substep(self, run: TracksObservation, model: Model, values: Mapping[str, float], times: np.ndarray) -> float:
-        """The substep [s] to simulate ``run`` with to ``times`` (T,) [s]: that of its first law. Raises NonFiniteError
-        for a law that is too stiff for it."""
-        body = self.body(run)
-        return self.held.take((run.name, body.spacing), body.substep(self.law(model, values), times))
+        """The substep [s] to simulate ``run`` with to ``times`` (T,) [s]: that of its first law, or shorter if the
+        effects ask for it (``halved``). Raises NonFiniteError for a law that is too stiff for it, MasivError if an
+        interval needs too many."""
+        body, last = self.body(run), float(times[-1])
+        law, effects = self.law(model, values), self.acting(run, model, values, last)
+        held = self.held.take((run.name, body.spacing), body.substep(law, times))
+        shortest = mean_interval(times) / body.config.max_substeps_per_frame
+        needed = body.substep(law, times, effects)
+        if self._held_values is None:
+            return halved(held, needed, shortest)
+        at = {**values, **self._held_values}
+        needed_there = body.substep(self.law(model, at), times, self.acting(run, model, at, last))
+        taken = halved(held, needed_there, shortest)
+        check_substep(taken, needed)
+        return taken
 
     def acting(
         self, run: TracksObservation, model: Model, values: Mapping[str, float], duration: float

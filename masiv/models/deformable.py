@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ from masiv.effects.effect import Effect
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.law import Law
 from masiv.mpm.config import SimulatorConfig
-from masiv.mpm.design import grid_spacing, substeps_per_frame
+from masiv.mpm.design import HELD_MARGIN, NO_DEMAND, grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.mpm.state import State
@@ -94,9 +95,9 @@ class DeformableBody:
         active = ActiveEffects(tuple(members), context)
         return with_clamp(active, self.normals, self.heights) if self.is_clamped else active
 
-    def substeps(self, law: Law, interval: float) -> int:
-        """The fewest equal substeps in ``interval`` [s] that ``law`` is stable with. Raises MasivError if those are too
-        many."""
+    def substeps(self, law: Law, interval: float, effects: ActiveEffects | None = None) -> int:
+        """The fewest equal substeps in ``interval`` [s] that ``law`` with ``effects`` is stable with. Raises MasivError
+        if those are too many."""
         return substeps_per_frame(
             spacing=self.spacing,
             wave_modulus=law.wave_modulus(),
@@ -104,6 +105,7 @@ class DeformableBody:
             speed=self.speed,
             frame_time=interval,
             config=self.config,
+            demand=NO_DEMAND if effects is None else effects.substep_demand(),
         )
 
     def rollout(
@@ -153,12 +155,10 @@ class HeldSubsteps:
     """The substep of the first law of each key, held for the laws after it.
 
     What a grid loses depends on the substep by millimetres, so that a jump of it would be mistaken for a derivative. A
-    law that is stiffer than the held substep allows is refused, as one that diverges.
-    """
+    law that is stiffer than the held substep allows by more than ``HELD_MARGIN`` is refused, as one that diverges.
 
-    MARGIN = 1.4
-    """How many times shorter a substep a law may need. Its Courant number is then this times
-    ``simulator.courant_number``: below the limit of 1 up to a setting of 0.71 (default 0.3); not derived above."""
+    What effects ask for in addition divides the held substep, see ``halved``.
+    """
 
     def __init__(self) -> None:
         self._held: dict[Hashable, float] = {}
@@ -167,13 +167,37 @@ class HeldSubsteps:
         """The substep [s] to take for a law that is stable with ``needed`` [s]; ``first`` [s], ``needed`` if None, is
         held if nothing is yet. Raises NonFiniteError."""
         held = self._held.setdefault(key, needed if first is None else first)
-        if needed * self.MARGIN < held * (1 - 1e-9):
-            raise NonFiniteError(0, 0, f"the law needs substeps of {needed:.3g} s, {held:.3g} s are taken")
+        _refuse_if_too_long("the law", held, needed)
         return held
 
     def clear(self) -> None:
         """Hold nothing."""
         self._held.clear()
+
+
+def halved(held: float, needed: float, shortest: float) -> float:
+    """The substep [s] for effects that need ``needed`` [s] where the law alone is simulated with ``held`` [s].
+
+    It is ``held`` as long as its margin is enough: an effect that is weak is compared with its absence on equal terms.
+    Else it is that over the smallest power of two that is enough, not below ``shortest`` [s], which the configuration
+    allows: a strength at which it changes is rare, and the motion is a function of a model's values alone, whatever was
+    simulated before and in whichever process. Derivatives are taken at the substep of the point that they are for, see
+    ``ForwardModel.held_at``.
+    """
+    if needed * HELD_MARGIN >= held * (1 - 1e-9):
+        return held
+    halvings = math.ceil(math.log2(held / needed) - 1e-9)
+    return min(held, max(held / 2**halvings, shortest))
+
+
+def check_substep(taken: float, needed: float) -> None:
+    """Raises NonFiniteError if ``taken`` [s] is longer than ``needed`` [s] by more than ``HELD_MARGIN``."""
+    _refuse_if_too_long("the law with its effects", taken, needed)
+
+
+def _refuse_if_too_long(what: str, taken: float, needed: float) -> None:
+    if needed * HELD_MARGIN < taken * (1 - 1e-9):
+        raise NonFiniteError(0, 0, f"{what} needs substeps of {needed:.3g} s, {taken:.3g} s are taken")
 
 
 @contextmanager

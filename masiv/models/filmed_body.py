@@ -13,7 +13,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.context import EffectContext
 from masiv.effects.effect import Effect
 from masiv.materials.law import Law
-from masiv.models.deformable import DeformableBody, HeldSubsteps
+from masiv.models.deformable import DeformableBody, HeldSubsteps, halved
 from masiv.models.initial_state import InitialState, rigid_initial_state
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.motion import Observed
@@ -97,21 +97,32 @@ class FilmedBody:
         """Of the grid [m]."""
         return self.body.spacing
 
-    def substeps(self, law: Law) -> int:
-        """Substeps in a frame for ``law``; a multiple of 8, so that a law that changes a little keeps its number.
-        Raises MasivError if those are too many."""
+    def substeps(self, law: Law, effects: ActiveEffects | None = None) -> int:
+        """Substeps in a frame for ``law`` with ``effects`` (``known`` if None); a multiple of 8, so that a law that
+        changes a little keeps its number. Raises MasivError if those are too many."""
         unit = 8 * self.samples
-        return -(-self.min_substeps(law) // unit) * unit
+        return -(-self.min_substeps(law, effects) // unit) * unit
 
-    def min_substeps(self, law: Law) -> int:
-        """The fewest substeps in a frame that ``law`` is stable with. Raises MasivError if those are too many."""
-        return self.body.substeps(law, 1 / self.scene.fps)
+    def min_substeps(self, law: Law, effects: ActiveEffects | None = None) -> int:
+        """The fewest substeps in a frame that ``law`` with ``effects`` (``known`` if None) is stable with. Raises
+        MasivError if those are too many."""
+        return self.body.substeps(law, 1 / self.scene.fps, self._acting(effects))
 
     def held_substeps(self, law: Law, held: HeldSubsteps, key: Hashable) -> int:
-        """Substeps in a frame to take for ``law``: as many as ``held`` has for ``key``. Raises NonFiniteError if those
-        are too few, and MasivError if the law needs too many."""
+        """Substeps in a frame to take for ``law`` and what is ``known``: as many as ``held`` has for ``key``. Raises
+        NonFiniteError if those are too few, and MasivError if the law needs too many."""
         first, needed = (1 / (self.scene.fps * n) for n in (self.substeps(law), self.min_substeps(law)))
         return round(1 / (self.scene.fps * held.take(key, needed, first)))
+
+    def substeps_with(self, held: int, law: Law, effects: ActiveEffects) -> int:
+        """Substeps in a frame for ``law`` with ``effects``, where the law alone takes ``held``; see ``halved``. Raises
+        MasivError if those are too many."""
+        unit, most = 8 * self.samples, self.body.config.max_substeps_per_frame
+        asked = self.min_substeps(law, effects)
+        return round(1 / halved(1 / held, 1 / asked, 1 / (-(-most // unit) * unit)))
+
+    def _acting(self, effects: ActiveEffects | None) -> ActiveEffects | None:
+        return self.body.effects(self.known, self.context()) if effects is None and self.known else effects
 
     def context(self, fit_frames: int | None = None) -> EffectContext:
         """What effects may know of the recording, of its motion the first ``fit_frames`` frames after frame 0."""
@@ -134,9 +145,8 @@ class FilmedBody:
         steps: substeps a frame, a multiple of ``samples``; as many as the law needs if None. effects: ``known`` if
         None. Raises NonFiniteError, and MasivError if the law needs too many substeps.
         """
-        if effects is None and self.known:
-            effects = self.body.effects(self.known, self.context())
-        steps = steps or self.substeps(law)
+        effects = self._acting(effects)
+        steps = steps or self.substeps(law, effects)
         # The ground is the plane y = 0 of the simulation: to raise it, the body is lowered.
         raised = start.ground_offset + (effects.ground_shift() if effects else 0.0)
         shift = torch.stack([torch.zeros(()), raised, torch.zeros(())])

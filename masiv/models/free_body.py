@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,7 +14,7 @@ from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.effect import ContactEffect
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model, effect_parameters, plain_term
 from masiv.models.cache import RolloutCache
-from masiv.models.deformable import HeldSubsteps, failures_as_divergence
+from masiv.models.deformable import HeldSubsteps, check_substep, failures_as_divergence
 from masiv.models.families import law_of
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, initial_state_parameters
@@ -48,10 +49,12 @@ class FreeBodySetup:
 class FreeBodyModel(ForwardModel):
     """Law and effects are shared by all recordings; each has its initial state and its part of the grid correction.
 
-    The number of substeps is held for each family and recording, see ``HeldSubsteps``.
+    The number of substeps is held for each family and recording, see ``HeldSubsteps``; effects on the stress multiply
+    it if their strength asks for that, see ``halved``.
     """
 
     observations: Sequence[VideoObservation]
+    _held_values: Mapping[str, float] | None = None
 
     def __init__(self, setups: Sequence[FreeBodySetup], held: HeldSubsteps | None = None) -> None:
         """held: substeps to go on with. Raises ValueError for equal names."""
@@ -65,6 +68,12 @@ class FreeBodyModel(ForwardModel):
         law = law_of(model.family, values)
         for index, r in enumerate(self.setups):
             r.body.held_substeps(law, self.held, (index, model.family.kind))
+
+    def held_at(self, values: Mapping[str, float]) -> FreeBodyModel:
+        """See ``ForwardModel``."""
+        out = copy.copy(self)
+        out._held_values = dict(values)
+        return out
 
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
         """Grid corrections, law, initial states, effects. Grid corrections come first: their derivatives need no other
@@ -150,17 +159,36 @@ class FreeBodyModel(ForwardModel):
         """Positions (frames * samples, N, 3) [m, simulation axes] of recording ``index``; the last ones are kept.
         Raises NonFiniteError."""
         own = sorted((n, v) for n, v in values.items() if not n.startswith(GRID_CORRECTION))
-        key = (model.family.kind, model.contact, model.effects, own, frames)
+        body, law = self.setups[index].body, law_of(model.family, values)
+        effects = self.active(model, values, body)
+        with failures_as_divergence():
+            steps = self._substeps(model, values, index, effects)
+            key = (model.family.kind, model.contact, model.effects, own, frames, steps)
 
-        def rolled_out() -> dict[str, np.ndarray]:
-            body, law = self.setups[index].body, law_of(model.family, values)
-            start, effects = self.initial_state(values, index), self.active(model, values, body)
-            with failures_as_divergence():
-                steps = body.held_substeps(law, self.held, (index, model.family.kind))
+            def rolled_out() -> dict[str, np.ndarray]:
                 self.rollouts += 1
+                start = self.initial_state(values, index)
                 return {"positions": body.run(law, start, model.contact, frames, steps, effects).numpy()}
 
-        return torch.from_numpy(self._kept[index].get(key, rolled_out)["positions"])
+            return torch.from_numpy(self._kept[index].get(key, rolled_out)["positions"])
+
+    def _substeps(
+        self, model: Model, values: Mapping[str, float], index: int, effects: ActiveEffects | None
+    ) -> int:  # fmt: skip
+        """Of recording ``index``, in a frame. Raises NonFiniteError if those that are held are too few, and MasivError
+        if those that the law or the effects ask for are too many."""
+        body, law = self.setups[index].body, law_of(model.family, values)
+        held = body.held_substeps(law, self.held, (index, model.family.kind))
+        if effects is None:
+            return held
+        if self._held_values is None:
+            return body.substeps_with(held, law, effects)
+        at = {**values, **self._held_values}
+        there = self.active(model, at, body)
+        assert there is not None
+        steps = body.substeps_with(held, law_of(model.family, at), there)
+        check_substep(1 / (body.scene.fps * steps), 1 / (body.scene.fps * body.min_substeps(law, effects)))
+        return steps
 
     def fields(self, model: Model, values: Mapping[str, float], *, held_out: bool = False) -> list[np.ndarray]:
         """See ``ForwardModel``; (K, N, 3) [m, simulation axes]."""

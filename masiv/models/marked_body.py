@@ -60,11 +60,12 @@ class MarkedBody(DeformableBody):
         """Particles (T, N, 3) [m, simulation axes] -> markers (T, len(markers), 3) [m, world]."""
         return self.axes.points_to_world(self.attachment.apply(positions.detach().double()).numpy())
 
-    def substep(self, law: Law, times: np.ndarray) -> float:
-        """The longest [s] that divides the mean interval of ``times`` (T,) [s] evenly and that ``law`` is stable with.
-        Raises MasivError if an interval needs too many, InputError for times that do not ascend from 0."""
-        interval = float(checked_instants(times)[-1]) / max(len(times) - 1, 1)
-        return interval / self.substeps(law, interval)
+    def substep(self, law: Law, times: np.ndarray, effects: ActiveEffects | None = None) -> float:
+        """The longest [s] that divides the mean interval of ``times`` (T,) [s] evenly and that ``law`` with ``effects``
+        is stable with. Raises MasivError if an interval needs too many, InputError for times that do not ascend from
+        0."""
+        interval = mean_interval(times)
+        return interval / self.substeps(law, interval, effects)
 
     def run(
         self,
@@ -82,14 +83,18 @@ class MarkedBody(DeformableBody):
         effects: with the clamp, see ``DeformableBody.effects``; the clamp alone if None. substep [s]: see ``substep``.
         deflection: see ``released``. Raises NonFiniteError, and as ``substep``.
         """
-        times = checked_instants(times)
-        duration = float(times[-1])
-        effects = effects or self.effects((), self.context(duration, duration / max(len(times) - 1, 1)))
-        substep = substep or self.substep(law, times)
+        interval = mean_interval(times)
+        effects = effects or self.effects((), self.context(float(times[-1]), interval))
+        substep = substep or self.substep(law, times, effects)
         outputs = [round(float(t) / substep) for t in times]
         state = self.released(dtype, deflection)
         positions = self.rollout(law, state, outputs, substep=substep, contact=self.contact, effects=effects)
         return np.array(outputs) * substep, positions
+
+
+def mean_interval(times: np.ndarray) -> float:
+    """[s] between ``times`` (T,) [s], which begin at the release. Raises InputError unless they ascend from 0."""
+    return float(checked_instants(times)[-1]) / max(len(times) - 1, 1)
 
 
 def marked_body(

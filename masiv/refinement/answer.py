@@ -35,6 +35,8 @@ def outcome(row: Mapping[str, Any]) -> str:
         return "; ".join(row["impossible"])
     factor = row["log_bayes_factor"]
     known = "" if factor is None else f"log Bayes factor {factor:.1f}"
+    if row.get("not_weighed"):
+        known = f"not weighed: {row['not_weighed']}"
     if not row["converged"]:
         known += ", not converged" if known else "not converged"
     return known or "not weighed"

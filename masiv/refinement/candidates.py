@@ -133,10 +133,11 @@ class ScoreTest:
         strengths = term.strengths
         fixed = {p.name: value for p, value in zip(term.others, guess, strict=True)}
         absent = {**self.base.values, **{p.name: 0.0 for p in strengths}, **fixed}
+        near = self.forward_model.held_at(absent)
         columns = []
         for p in strengths:
             far = min(size * p.step, p.upper)
-            reached = self.forward_model.residual(model, {**absent, p.name: far})
+            reached = near.residual(model, {**absent, p.name: far})
             columns.append((reached - self.base.residual) / far)
         s = np.stack(columns, axis=1)
         s_left = _without(self.nuisance, s * self.weight[:, None])

@@ -118,6 +118,7 @@ def _upper_limit(result: RefineResult, limit: UpperLimit) -> dict[str, Any]:
         "unit": term.units[term.strengths[0].name],
         "motion_mm": limit.motion_mm,
         "determined": limit.determined,
+        "reason": limit.reason,
     }
 
 
@@ -213,6 +214,7 @@ def _refit(result: RefineResult, done: Round, trial: Trial) -> dict[str, Any]:
         "accepted": done.accepted is trial,
         "converged": trial.converged,
         "impossible": list(trial.impossible),
+        "not_weighed": trial.not_weighed,
     }
 
 
@@ -388,9 +390,10 @@ def _refit_line(row: Mapping[str, Any]) -> str:
 def _limit_lines(limits: Sequence[Mapping[str, Any]]) -> list[str]:
     """What is excluded, and what this recording says little of."""
     told = [f"{x['effect']} {x['strength']:.2g} {x['unit']}".strip() for x in limits if x["determined"]]
-    open_ = [x["effect"] for x in limits if not x["determined"]]
+    open_ = [x["effect"] for x in limits if not x["determined"] and not x["reason"]]
     lines = [f"95 % upper limits: {', '.join(told)}"] if told else []
-    return [*lines, *([f"this recording says little of {', '.join(open_)}"] if open_ else [])]
+    lines += [f"this recording says little of {', '.join(open_)}"] if open_ else []
+    return [*lines, *(f"no upper limit of {x['effect']}: {x['reason']}" for x in limits if x["reason"])]
 
 
 def _probable(probability: float | None) -> str:

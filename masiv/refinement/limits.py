@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from masiv.errors import NonFiniteError
 from masiv.inference.evidence import Evidence, strength_scales
 from masiv.inference.linear_model import LinearModel, linear_model
 from masiv.models.base import EffectTerm, ForwardModel
@@ -24,13 +23,19 @@ class UpperLimit:
     """strength: 95 % upper limit of the size of an effect's strength, in its unit. motion_mm: root mean square change
     of the observed motion that it makes at that limit. determined: whether the limit is below the middle of the sizes
     that are likely beforehand: if not, the recording says little of the effect. log_bayes_factor: for the effect, of
-    the linear model."""
+    the linear model. reason: why there is no limit, None if there is one."""
 
     effect: str
     strength: float
     motion_mm: float
     determined: bool
     log_bayes_factor: float
+    reason: str | None = None
+
+    @classmethod
+    def unknown(cls, effect: str, reason: str) -> UpperLimit:
+        """Of an effect whose strength this recording does not limit."""
+        return cls(effect, math.inf, 0.0, False, 0.0, reason)
 
 
 def sensitivity(
@@ -62,7 +67,7 @@ def upper_limit(
     # Along axes that were not measured nothing is seen.
     seen = [k for k in range(len(term.strengths)) if any(j[..., k].any() for j in columns.jacobians)]
     if not seen:
-        return UpperLimit(term.name, math.inf, 0.0, False, 0.0)
+        return UpperLimit.unknown(term.name, "it moves nothing along the axes that were measured")
     index = [names.index(term.strengths[k].name) for k in seen]
     # Of the widest prior of the strength: the limit is what the data say.
     wide = evidence.marginal_with(joined, replace(priors, precision=priors.precision[-1:]))
@@ -77,13 +82,3 @@ def upper_limit(
     motion = math.sqrt(float(np.quantile(squares, LEVEL)) / count)
     middle = math.sqrt(sum(float(np.median(strength_scales(p))) ** 2 for k in seen for p in [term.strengths[k]]))
     return UpperLimit(term.name, size, 1e3 * motion, size < middle, whole.log_evidence - log_evidence)
-
-
-def try_sensitivity(
-    forward_model: ForwardModel, at: LinearModel, name: str, places: dict[str, float]
-) -> tuple[dict[str, float], LinearModel] | None:
-    """``sensitivity``, None if the simulation diverges."""
-    try:
-        return sensitivity(forward_model, at, name, places)
-    except NonFiniteError:
-        return None

@@ -87,10 +87,10 @@ def prepare(
 
 
 def finer_than(coarse: FilmedBody, count: int, simulator: SimulatorConfig) -> SimulatorConfig:
-    """``simulator`` for ``count`` particles of the body of ``coarse``, with as many more substeps for a law as its
-    finer grid asks for: a law that can be simulated there can be here."""
+    """``simulator`` for ``count`` particles of the body of ``coarse``, with as many more substeps as its finer grid
+    may ask for, in proportion for sound and to the square for a viscosity: what can be simulated there can be here."""
     ratio = coarse.spacing / grid_spacing(coarse.volume, count, simulator)
-    most = math.ceil(SPARE_SUBSTEPS * max(ratio, 1.0) * coarse.body.config.max_substeps_per_frame)
+    most = math.ceil(SPARE_SUBSTEPS * max(ratio, 1.0) ** 2 * coarse.body.config.max_substeps_per_frame)
     return simulator.model_copy(update={"max_substeps_per_frame": most})
 
 

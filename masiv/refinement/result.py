@@ -94,8 +94,10 @@ class RefineResult:
         return tuple(self.forward_model.term(n) for n in self.after.model.effects if n not in known)
 
     def reduced_chi(self, fitted: ModelFit) -> float:
-        """See ``NoiseModel.reduced_chi``."""
-        return NoiseModel(self.observations).reduced_chi(fitted.squares)
+        """See ``NoiseModel.reduced_chi``. ``before`` is judged by the ``residual_std`` of its own motion: with an
+        effect a body touches other things, and what a finer grid changes is another."""
+        whitened = self.search.whitened_before if fitted is self.before else None
+        return NoiseModel((whitened or self.forward_model).observations).reduced_chi(fitted.squares)
 
     @property
     def verdict(self) -> str:

@@ -16,13 +16,15 @@ from masiv.refinement.limits import UpperLimit
 class Trial:
     """An effect that was fitted through the rollout. impossible: why it cannot act as fitted, or cannot be told from a
     simpler one. converged: False if the fit did not reach what the ranking promised: that says nothing against the
-    effect. log_bayes_factor: of its model against the best one with an effect fewer; None if it was not worked out."""
+    effect. log_bayes_factor: of its model against the best one with an effect fewer; None if it was not worked out.
+    not_weighed: why it could not be worked out."""
 
     candidate: Candidate
     fitted: ModelFit
     impossible: tuple[str, ...] = ()
     converged: bool = True
     log_bayes_factor: float | None = None
+    not_weighed: str | None = None
 
     @property
     def effect(self) -> str:
@@ -65,7 +67,7 @@ class SearchResult:
     model without effects. after: with what was accepted, ``before`` itself if nothing was. null_probability: that no
     effect acts. predictive_p: of a residual as large as that of ``after``, see ``predictive_p``. limits: of effects
     that were not accepted. discrepancy: ``after`` with a smooth force for what is still unexplained, None if there is
-    no need or no use."""
+    no need or no use. whitened_before: with the observations as whitened for ``before``; None: as ``forward_model``."""
 
     forward_model: ForwardModel
     before: ModelFit
@@ -75,6 +77,7 @@ class SearchResult:
     predictive_p: dict[str, float] | None = None
     limits: tuple[UpperLimit, ...] = ()
     discrepancy: ModelFit | None = None
+    whitened_before: ForwardModel | None = None
 
 
 def rank_trials(trials: Sequence[Trial]) -> list[Trial]:

@@ -15,7 +15,7 @@ from masiv.models.base import ForwardModel
 from masiv.refinement.candidates import score
 from masiv.refinement.effect_fit import BROYDEN_STEPS, fit_with_effect
 from masiv.refinement.hypotheses import Hypothesis, Posterior, linearized, log_prior, weighed
-from masiv.refinement.limits import UpperLimit, try_sensitivity, upper_limit
+from masiv.refinement.limits import UpperLimit, sensitivity, upper_limit
 from masiv.refinement.rounds import Round, SearchResult
 from masiv.refinement.search_round import run_round
 from masiv.refinement.search_state import SearchSettings, SearchState
@@ -25,7 +25,8 @@ from masiv.workers import TaskError
 DISCREPANCY_FORCE = "smooth_force"
 """The effect that stands in for what no effect of the library explains."""
 MIN_ROBUST_SCALE = 5.0
-"""Robust scale of the search over the noise of the first observation, at the least."""
+"""Robust scale of the search over the noise of the noisiest observation, at the least: the whitened residual of an
+observation has its own ``noise_std``, and noise is no outlier in any of them."""
 WHITENING_PASSES = 2
 """How often the best law is chosen: the one that is best before ``residual_std`` is known may not be it."""
 RIVALS = 1
@@ -41,7 +42,7 @@ def search_effects(
     state, rounds = _add_effects(start, laws, settings)
     before = rounds[0].base if rounds else start.fit
     if settings.rank_only:
-        return SearchResult(state.forward_model, before, before, tuple(rounds))
+        return SearchResult(state.forward_model, before, before, tuple(rounds), whitened_before=start.forward_model)
     null = rounds[0].posterior.with_at_most(0) if rounds and rounds[0].posterior else 1.0
     after = state.fit if state.fit.model.effects else before
     checked = {"before": _predictive_p(start, before), "after": _predictive_p(state, after)}
@@ -51,7 +52,10 @@ def search_effects(
     limits = _upper_limits(state.with_fit(after), rounds, settings)
     if after is before:
         null = _with_unfitted(null, rounds, limits)
-    return SearchResult(state.forward_model, before, after, tuple(rounds), null, checked, tuple(limits), discrepancy)
+    return SearchResult(
+        state.forward_model, before, after, tuple(rounds), null, checked, tuple(limits), discrepancy,
+        whitened_before=start.forward_model,
+    )  # fmt: skip
 
 
 def whitened_start(
@@ -66,7 +70,7 @@ def whitened_start(
         whitened = with_residual_std(state.forward_model, first, observation_std)
         scale = max(
             robust_scale_of(whitened.residual(first.model, first.values)),
-            MIN_ROBUST_SCALE * whitened.observations[0].noise_std,
+            MIN_ROBUST_SCALE * max(e.noise_std for e in whitened.observations),
         )
         settings.progress("refine: fit whitened residuals", 0, 1, "")
         tasks = [(base, BROYDEN_STEPS, scale) for base in baselines]
@@ -158,10 +162,12 @@ def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchS
     out = []
     tasks = [(line, name, places.get(name, {})) for name in names]
     for done, (name, found) in enumerate(
-        zip(names, map_tasks(settings.workers, model, try_sensitivity, tasks), strict=True)
+        zip(names, map_tasks(settings.workers, model, sensitivity, tasks), strict=True)
     ):
         settings.progress(label, done + 1, len(names), name)
-        if found is not None and not isinstance(found, TaskError):
+        if isinstance(found, TaskError):
+            out.append(UpperLimit.unknown(name, found.reason))
+        else:
             out.append(upper_limit(evidence, line, terms, model.term(name), here, found))
     return out
 

@@ -289,12 +289,14 @@ def _judged(
     """The round with the posterior over the models without (``bases``) and with one effect more (``trials``)."""
     without = [state.fit, *bases[1:]]
     possible = [t for t in trials if not t.impossible]
-    hypotheses = _weighed(state, [*without, *(t.fitted for t in possible)], settings)
-    least = max(
-        (h.marginal.log_evidence for h in hypotheses if len(h.effects) == len(state.fit.model.effects)), default=0.0
-    )
-    known = {id(h.fitted): h.marginal.log_evidence - least for h in hypotheses}
-    trials = [replace(t, log_bayes_factor=known.get(id(t.fitted))) for t in trials]
+    hypotheses, failed = _weighed(state, [*without, *(t.fitted for t in possible)], settings)
+    simpler = [h.marginal.log_evidence for h in hypotheses if len(h.effects) == len(state.fit.model.effects)]
+    if not simpler:  # against what would an effect be probable?
+        raise MasivError(f"no model without a further effect can be weighed: {failed[id(state.fit)]}")
+    known = {id(h.fitted): h.marginal.log_evidence - max(simpler) for h in hypotheses}
+    trials = [
+        replace(t, log_bayes_factor=known.get(id(t.fitted)), not_weighed=failed.get(id(t.fitted))) for t in trials
+    ]
     trials.sort(key=lambda t: -math.inf if t.log_bayes_factor is None else t.log_bayes_factor, reverse=True)
     count = len(settings.considered(state.forward_model, state.fit.model)) + len(state.fit.model.effects)
     posterior = Posterior.of(hypotheses, count)
@@ -311,18 +313,23 @@ def _judged(
     return Round(base, attempts.ranking, tuple(trials), accepted, posterior, attempts.failures)
 
 
-def _weighed(state: SearchState, fits: Sequence[ModelFit], settings: SearchSettings) -> list[Hypothesis]:
-    """Those of ``fits`` that have derivatives over all instants, with their evidence."""
+def _weighed(
+    state: SearchState, fits: Sequence[ModelFit], settings: SearchSettings
+) -> tuple[list[Hypothesis], dict[int, str]]:
+    """Those of ``fits`` that have derivatives over all instants, with their evidence; of the others, by their id, why
+    not."""
     label = "refine: weigh models"
     settings.progress(label, 0, len(fits))
-    kept, lines = [], []
+    kept, lines, failed = [], [], {}
     results = map_tasks(settings.workers, state.forward_model, linearized, [(f,) for f in fits])
     for done, (fit, line) in enumerate(zip(fits, results, strict=True)):
         settings.progress(label, done + 1, len(fits))
-        if not isinstance(line, TaskError):
+        if isinstance(line, TaskError):
+            failed[id(fit)] = line.reason
+        else:
             kept.append(fit)
             lines.append(line)
-    return weighed(state.forward_model, kept, lines) if kept else []
+    return (weighed(state.forward_model, kept, lines) if kept else []), failed
 
 
 def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Trial:
@@ -333,8 +340,10 @@ def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Tr
         held=held_parameters(model, start),
     )  # fmt: skip
     best = _with_free_places(state, min(final, start, key=lambda f: f.cost))
-    [hypothesis] = _weighed(state, [best], settings) or [None]
-    done = replace(trial, fitted=hypothesis.with_posterior() if hypothesis else best)
+    hypotheses, failed = _weighed(state, [best], settings)
+    if not hypotheses:
+        return replace(trial, fitted=best, impossible=(f"at its best fit, {failed[id(best)]}",))
+    done = replace(trial, fitted=hypotheses[0].with_posterior())
     return replace(done, impossible=tuple(reasons_against(model, done)))
 
 

@@ -12,7 +12,7 @@ import torch
 from masiv.effects.active import ActiveEffects
 from masiv.errors import InputError, NonFiniteError
 from masiv.models.initial_state import rigid_initial_state
-from masiv.mpm.design import grid_spacing, substeps_per_frame
+from masiv.mpm.design import NO_DEMAND, grid_spacing, substeps_per_frame
 from masiv.mpm.simulator import Simulator
 from masiv.mpm.state import State
 from masiv.progress import Progress, silent
@@ -35,8 +35,9 @@ def simulate_free_body(
 ) -> Rollout:
     """``frames`` frames at k / fps [s] of the only body of ``twin``, its particles subdivided.
 
-    substeps: in a frame; as many as the present speed asks for if None. If the twin's clock is late, frames after the
-    first are the states at the times when they were really taken, not before the start. Raises NonFiniteError.
+    substeps: in a frame; as many as the present speed and the effects ask for if None. If the twin's clock is late,
+    frames after the first are the states at the times when they were really taken, not before the start. Raises
+    NonFiniteError.
     """
     twin = subdivide_twin(twin)
     effects = active_effects(twin, frames=frames, fps=fps)
@@ -102,7 +103,7 @@ def _intervals(
                 mass = twin.density * twin.volume * mass_ratio(effects)
                 acceleration = acceleration + axes.vectors_to_simulation(force.force) / mass
             if substeps is None:
-                steps = _substeps(twin, state, acceleration, duration)
+                steps = _substeps(twin, effects, state, acceleration, duration)
             else:
                 steps = max(1, math.ceil(substeps * duration * fps - 1e-6))
             simulator = _simulator(twin, acceleration, duration / steps)
@@ -124,8 +125,10 @@ def _intervals(
         yield whole, whole.position if observed is None else observed + raised
 
 
-def _substeps(twin: Twin, state: State, acceleration: np.ndarray, duration: float) -> int:
-    """Substeps for the next ``duration`` [s]: as many as the present speed asks for.
+def _substeps(
+    twin: Twin, effects: ActiveEffects | None, state: State, acceleration: np.ndarray, duration: float
+) -> int:  # fmt: skip
+    """Substeps for the next ``duration`` [s]: as many as the present speed and the effects ask for.
 
     acceleration (3,) [m/s^2, simulation frame]: of gravity and of what else acts on all mass alike.
     """
@@ -136,6 +139,7 @@ def _substeps(twin: Twin, state: State, acceleration: np.ndarray, duration: floa
         speed=float(state.velocity.norm(dim=1).max()) + float(np.linalg.norm(acceleration)) * duration,
         frame_time=duration,
         config=twin.simulator,
+        demand=NO_DEMAND if effects is None else effects.substep_demand(),
     )
 
 

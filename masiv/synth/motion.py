@@ -29,15 +29,23 @@ def simulate(spec: SynthSpec, body: Solid) -> np.ndarray:
     import torch
 
     from masiv.materials.classical import ClassicalLaw
+    from masiv.mpm.design import viscous_substep
     from masiv.mpm.rollout import at_rest
     from masiv.mpm.simulator import Simulator
 
     law = ClassicalLaw(spec.material.law, **spec.material.parameters)
     count = len(body.particles)
     spacing = (_PARTICLES_PER_CELL * body.volume / count) ** (1 / 3)
-    speed = math.sqrt(law.wave_modulus() / spec.material.density)
+    position = torch.as_tensor(body.particles, dtype=torch.float32)
+    effects = _effects(spec, position, body.volume)
+    demand = effects.substep_demand()
+    speed = math.sqrt(demand.modulus_factor * law.wave_modulus() / spec.material.density)
     fall = math.sqrt(np.square(spec.velocity).sum() + 2 * np.linalg.norm(spec.gravity) * spec.shape.clearance)
-    per_frame = max(1, math.ceil((speed + fall) / (_COURANT * spacing * spec.fps)))
+    diffusion = viscous_substep(
+        spacing=spacing, density=spec.material.density, viscosity=demand.viscosity, courant_number=_COURANT
+    )
+    rate = max((speed + fall) / (_COURANT * spacing), 1 / diffusion)
+    per_frame = max(1, math.ceil(rate / spec.fps))
     simulator = Simulator(
         particle_count=count,
         spacing=spacing,
@@ -50,8 +58,6 @@ def simulate(spec: SynthSpec, body: Solid) -> np.ndarray:
         memory_mb=250,
         grid_nodes=1 << 20,
     )
-    position = torch.as_tensor(body.particles, dtype=torch.float32)
-    effects = _effects(spec, position, body.volume)
     raised = torch.tensor([0.0, float(effects.ground_shift()), 0.0])
     omega = torch.tensor(spec.omega, dtype=torch.float32)
     velocity = torch.tensor(spec.velocity) + torch.linalg.cross(omega.expand_as(position), position - position.mean(0))

@@ -175,7 +175,7 @@ def _limits(page: Page, limits: Sequence[Mapping[str, Any]]) -> None:
                 _number(x["strength"]),
                 _unit(x["unit"]),
                 _number(x["motion_mm"]),
-                "yes" if x["determined"] else "no",
+                "yes" if x["determined"] else f"no: {x['reason']}" if x.get("reason") else "no",
             ]
             for x in sorted(limits, key=lambda x: not x["determined"])
         ],
