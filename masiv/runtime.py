@@ -36,7 +36,9 @@ def start(arch: str = "cpu") -> Any:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, and stdout may be for one JSON object
         # One of Taichi's own passes is half of a kernel's compilation, and LLVM does its work again; see ``adjoint``.
-        ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, cfg_optimization=False)
+        # It would warn of loops over more than 32 coefficients of an effect, which compile in seconds.
+        ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, cfg_optimization=False,
+                unrolling_limit=0)  # fmt: skip
     atexit.register(ti.reset)  # writes the kernel cache, which the next command starts from
     running = _taichi_config().arch
     if arch != "cpu" and running != known[arch]:

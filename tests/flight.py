@@ -39,7 +39,7 @@ def scene():
 
 
 def observed(effects, noise_m=3e-4, velocity=VELOCITY, omega=OMEGA):
-    """The motion of a cube that is thrown and lands, with ``effects`` {name: parameters} at work."""
+    """The motion of a cube that is thrown and lands, with ``effects`` {name or effect: parameters} at work."""
     side = round(COUNT ** (1 / 3))
     axis = (torch.arange(side) + 0.5) / side * SIDE
     start = torch.cartesian_prod(axis, axis, axis) + torch.tensor([0.0, 0.45, 0.0])
@@ -48,7 +48,10 @@ def observed(effects, noise_m=3e-4, velocity=VELOCITY, omega=OMEGA):
                           volume=SIDE**3, density=1000.0, gravity=(0.0, -9.8, 0.0),
                           max_substeps=SUBSTEPS, grid_nodes=NODES)  # fmt: skip
     setting = EffectContext(torch.tensor([0.0, -9.8, 0.0]), start, 1000 * SIDE**3 / COUNT, SIDE, FRAMES / FPS)
-    members = tuple((effect_named(name), torch.tensor(values)) for name, values in effects.items())
+    members = tuple(
+        (effect_named(kind) if isinstance(kind, str) else kind, torch.tensor(values))
+        for kind, values in effects.items()
+    )
     law = ClassicalLaw("neo_hookean", youngs_modulus=3e4, poissons_ratio=0.3)
     outputs = [k * steps for k in range(1, FRAMES)]
     with torch.no_grad():

@@ -11,6 +11,7 @@ from effect_cases import DT, F64, LAW, body, setting, simulator
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects
+from masiv.effects.smooth_force import GRADIENT_SPLINES, SPLINES, STRENGTHS, acceleration
 from masiv.materials.classical import ClassicalLaw
 from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import at_rest, rollout
@@ -265,15 +266,32 @@ def test_ground_height_and_time_offset_hand_their_shift_to_the_caller():
     assert [theta.grad.item() if theta.grad is not None else None for _, theta in active.members] == [1.0, 2.0, None]
 
 
-def test_smooth_force_is_linear_between_its_instants_and_in_space():
-    still = {f"{p.name}": 0.0 for p in effects()["smooth_force"].parameters}
-    span = 0.12
-    ramp = {**still, "span": span, **{f"acceleration_{k}_x": float(k) for k in range(4)}, "acceleration_3_z": 2.0}
-    v = last_velocity(run("smooth_force", list(ramp.values()), 150, gravity=WEIGHTLESS))
-    held = 0.15 - span  # after the last instant it stays as it is
-    np.testing.assert_allclose(v, [1.5 * span + 3 * held, 0, span / 3 + 2 * held], atol=2e-3)
-    pull = {**still, "span": span, "gradient_x_along_y": 3.0, "gradient_z_along_x": -2.0}
-    x = body(height=5.0)
-    middle = x.mean(0).numpy()
-    v = last_velocity(run("smooth_force", list(pull.values()), 10, x=x, gravity=WEIGHTLESS))
-    np.testing.assert_allclose(v, [0.01 * 3 * middle[1], 0, -0.01 * 2 * middle[0]], rtol=1e-3, atol=1e-5)
+def test_smooth_force_is_the_field_that_it_is_said_to_be():
+    """Velocity of the mean: the integral of the field over time, constant after its span, mean over the body."""
+    theta = np.zeros(STRENGTHS + 4)
+    random = np.random.default_rng(5)
+    theta[:STRENGTHS] = random.normal(size=STRENGTHS) * np.where(np.arange(STRENGTHS) < 3 * SPLINES, 10.0, 5.0)
+    theta[STRENGTHS:] = 0.12, 0.3, 4.8, -0.2
+    steps = 150
+    x = run("smooth_force", theta.tolist(), steps, gravity=WEIGHTLESS, outputs=list(range(1, steps + 1)))
+    places = torch.cat([body(height=5.0)[None], x]).numpy()
+    field = acceleration(theta, places[:-1], DT * np.arange(steps)).mean(1)
+    velocity = np.diff(places, axis=0).mean(1) / DT
+    np.testing.assert_allclose(velocity, DT * np.cumsum(field, axis=0), atol=2e-3 * np.abs(velocity).max())
+
+
+def test_smooth_force_can_change_linearly_in_time():
+    """Splines reproduce a straight line between its ends, and stay at its end."""
+    theta = np.zeros(STRENGTHS + 4)
+    theta[: 3 * SPLINES : 3] = (np.arange(SPLINES) - 0.5) / (SPLINES - 2)
+    theta[STRENGTHS] = 2.0
+    times = np.array([0.0, 0.3, 1.0, 1.9, 2.0, 3.0])
+    found = acceleration(theta, np.zeros((len(times), 1, 3)), times)[:, 0]
+    np.testing.assert_allclose(found, np.outer(np.minimum(times / 2, 1.0), [1, 0, 0]), atol=1e-12)
+    theta[:] = 0.0
+    turn = np.array([[0.0, 3.0, 0.0], [0.0, 0.0, 0.0], [-2.0, 0.0, 0.0]])  # what acts along a row, by a place's column
+    theta[3 * SPLINES : STRENGTHS] = np.tile(turn.T.ravel(), GRADIENT_SPLINES)
+    theta[STRENGTHS:] = 2.0, 0.1, 0.2, 0.3
+    place = np.array([0.5, -0.5, 1.0])
+    found = acceleration(theta, np.broadcast_to(place, (len(times), 1, 3)), times)[:, 0]
+    np.testing.assert_allclose(found, np.tile(turn @ (place - theta[-3:]), (len(times), 1)), atol=1e-12)

@@ -16,7 +16,7 @@ from masiv.refinement.config import RefineConfig
 from masiv.refinement.document import document, text
 from masiv.refinement.effect_fit import fit_with_effect
 from masiv.refinement.rounds import Trial
-from masiv.refinement.search import DISCREPANCY_FORCE, whitened_start
+from masiv.refinement.search import whitened_start
 from masiv.refinement.search_round import could_improve
 from masiv.refinement.search_state import SearchSettings
 from masiv.refinement.stage import refine
@@ -212,19 +212,6 @@ def test_effects_that_are_known_are_not_called_added():
     result = refined(model, known=["linear_drag"])
     assert result.before.model.effects == ("linear_drag",)
     assert [t.name for t in result.accepted] == ["gravity_scale"]
-
-
-def test_a_force_stands_in_for_what_no_effect_explains():
-    unknown = pattern(1, np.sin(9 * TIMES), 1 + POINTS[:, 0])
-    library = {**EFFECTS, DISCREPANCY_FORCE: unknown}
-    model = LinearModel({f"{DISCREPANCY_FORCE}.strength": 0.4}, effects=library)
-    model.candidates = lambda model: [n for n in EFFECTS if n not in model.effects]
-    result = refine(model, [baseline(model)], replace(settings({"effects": ["viscosity"]}), discrepancy_force=True))
-    assert result.accepted == ()
-    assert result.verdict == "unexplained residual"
-    assert result.changes_twin
-    assert result.twin_fit.model.effects == (DISCREPANCY_FORCE,)
-    assert document(result)["discrepancy_force"]["theta"] == {"strength": pytest.approx(0.4, rel=0.01)}
 
 
 def test_names_are_checked_before_anything_is_simulated():

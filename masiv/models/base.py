@@ -23,6 +23,7 @@ from masiv.effects.catalogue import effect_named
 from masiv.effects.context import EffectContext
 from masiv.models.families import Family
 from masiv.models.parameters import Parameter
+from masiv.scene.transforms import SimulationFrame
 
 Self = TypeVar("Self", bound="ForwardModel")
 
@@ -154,6 +155,10 @@ class ForwardModel(ABC):
         NonFiniteError."""
         found = zip(self.observations, self.fields(model, values), strict=True)
         return np.concatenate([e.whiten(f).ravel() for e, f in found])
+
+    def effect_axes(self, index: int) -> SimulationFrame:
+        """Axes in which effects act in recording ``index``: those of the world, unless a subclass has others."""
+        return SimulationFrame(np.eye(3), np.zeros(3))
 
     def nuisance(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray:
         """Derivatives (T, N, A, Q) of recording ``index`` by what is fitted to it alone for each model, such as the

@@ -20,6 +20,7 @@ from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.models.parameters import Parameter
 from masiv.observations.video import VideoObservation
+from masiv.scene.transforms import SimulationFrame
 
 GRID_CORRECTION = "grid_change"
 """Parameter ``grid_change@recording``: how much there is of the mean of its grid corrections."""
@@ -111,6 +112,10 @@ class FreeBodyModel(ForwardModel):
         instead = effect_named(name).hints.replaces_parameter
         replaced = () if instead is None else tuple(f"{instead}@{e.name}" for e in self.observations)
         return replace(term, replaces_parameter=replaced)
+
+    def effect_axes(self, index: int) -> SimulationFrame:
+        """See ``ForwardModel``."""
+        return self.observations[index].simulation_axes
 
     def reset_initial_conditions(self, values: Mapping[str, float]) -> dict[str, float]:
         """``values`` with each initial state as it was estimated from free flight."""

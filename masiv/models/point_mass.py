@@ -138,6 +138,10 @@ class PointMassModel(ForwardModel):
             self.terms[name] = EffectTerm(name, effect, tuple(made[:cut]), tuple(made[cut:]), guesses, units, bodies)
         return self.terms[name]
 
+    def effect_axes(self, index: int) -> SimulationFrame:
+        """See ``ForwardModel``."""
+        return self.frame
+
     def parameters_of(self, term: EffectTerm, body: str) -> tuple[Parameter, ...]:
         """The parameters of ``term`` for one of its bodies."""
         return tuple(p for p in term.parameters if " of " not in p.name or p.name.endswith(f" of {body}"))

@@ -74,6 +74,11 @@ class Observation:
         """``values`` (T, N, A) [m] along axes of the world."""
         return self.values
 
+    def places_in_world(self, elsewhere: np.ndarray) -> np.ndarray:
+        """Where the points were (T, N, 3) [m, world], NaN if not seen; along axes that were not
+        measured, those of ``elsewhere`` (3,) [m, world]."""
+        return self.values_in_world
+
     def field_in_world(self, field: np.ndarray) -> np.ndarray:
         """A residual (K, N, A) [m] along axes of the world."""
         return field

@@ -36,6 +36,12 @@ class TracksObservation(Observation):
         """Whether the run is fitted, not held out."""
         return self.fit_count > 0
 
+    def places_in_world(self, elsewhere: np.ndarray) -> np.ndarray:
+        """See ``Observation``."""
+        out = np.tile(np.asarray(elsewhere, dtype=np.float64), (*self.values.shape[:2], 1))
+        out[..., list(self.axes)] = self.values
+        return out
+
     def shortened(self, duration: float) -> TracksObservation:
         """The first ``duration`` [s] of what is compared."""
         kept = self.times <= self.skipped + duration

@@ -17,10 +17,11 @@ from masiv.models.free_body import GRID_CORRECTION
 from masiv.observations.base import rms_mm
 from masiv.refinement.answer import answer, outcome
 from masiv.refinement.candidates import Candidate
+from masiv.refinement.discrepancy import DISCREPANCY_FORCE
+from masiv.refinement.discrepancy_field import peak, sampled_fields, share
 from masiv.refinement.limits import UpperLimit
 from masiv.refinement.result import ADDED, NOTHING, RANKED, BodyResult, Proposal, RefineResult, SharedFit
 from masiv.refinement.rounds import Round, Trial, alternatives
-from masiv.refinement.search import DISCREPANCY_FORCE
 
 SCHEMA = 3
 WORST_POINTS = 0.1
@@ -176,6 +177,7 @@ def _discrepancy(result: RefineResult) -> dict[str, Any] | None:
     return {
         "effect": DISCREPANCY_FORCE, **_parameters(term, fitted),
         "fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm,
+        "share": share(result), "peak": peak(sampled_fields(result)), "in_twin": result.force_in_twin,
     }  # fmt: skip
 
 
@@ -295,7 +297,10 @@ def _proposal(proposal: Proposal) -> dict[str, Any]:
 def arrays(result: RefineResult) -> dict[str, Any]:
     """refine.npz: ``observations``, their names; and of each, named ``key@observation``, ``times`` (T,) [s], ``points``
     (N, 3) [m] at the start, ``observed``, ``before`` and ``after`` (T, N, A) [m], the last two simulated less observed,
-    and ``fit_count``, how many instants were fitted. World frame, along the A axes that were measured."""
+    and ``fit_count``, how many instants were fitted. World frame, along the A axes that were measured.
+
+    With a discrepancy force also ``force_places`` (T, S, 3) [m], where S of the points were (NaN if not seen), and
+    ``force`` (T, S, 3) [m/s^2], the acceleration there; world frame."""
     out: dict[str, Any] = {"observations": np.array([e.name for e in result.observations])}
     for e, before, after in zip(result.observations, result.before.fields, result.after.fields, strict=True):
         own = {
@@ -307,6 +312,8 @@ def arrays(result: RefineResult) -> dict[str, Any]:
             "fit_count": np.array(e.fit_count),
         }
         out |= {f"{key}@{e.name}": value for key, value in own.items()}
+    for f in sampled_fields(result):
+        out |= {f"force_places@{f.observation}": f.places, f"force@{f.observation}": f.acceleration}
     return out
 
 
@@ -365,6 +372,7 @@ def text(document: Mapping[str, Any]) -> str:
             f"a smooth force without a known cause would leave {force['fit_rmse_mm']:.1f} mm"
             f"{_held(force['held_out_rmse_mm'])}: it stands in for the discrepancy and explains nothing"
         )
+        lines += _force_lines(force)
     lines += _several_bodies(shown["bodies"], shown["shared"])
     if shown["verdict"] != RANKED:
         lines.append(
@@ -380,6 +388,21 @@ def text(document: Mapping[str, Any]) -> str:
             f"{n['predicted_difference_mm']:.0f} mm apart"
         )
     return "\n".join([*lines, answer(shown)])
+
+
+def _force_lines(force: Mapping[str, Any]) -> list[str]:
+    """When, where and which way the force is strongest."""
+    peak = force["peak"]
+    if peak is None:
+        return []
+    way = ", ".join(f"{v:.2f}" for v in peak["direction"])
+    place = ", ".join(f"{v:.2f}" for v in peak["place"]["value"])
+    shares = [f"{100 * s:.0f} % {what}" for what, s in zip(("fitted", "held out"), force["share"].values(), strict=True)
+              if s is not None]  # fmt: skip
+    return [
+        f"  it is strongest at {peak['time']['value']:.2f} s at ({place}) m: {peak['acceleration']['value']:.2g} m/s^2 "
+        f"along ({way}); share of the residual {', '.join(shares)}"
+    ]
 
 
 def _refit_line(row: Mapping[str, Any]) -> str:

@@ -120,11 +120,21 @@ class RefineResult:
         return self.search.predictive_p or {"before": 1.0, "after": 1.0}
 
     @property
+    def force_in_twin(self) -> bool:
+        """Whether there is a force for the discrepancy that does not make the held-out motion worse."""
+        force = self.search.discrepancy
+        if force is None:
+            return False
+        held, before = force.held_out_mm, self.after.held_out_mm
+        return held is None or before is None or held <= before
+
+    @property
     def changes_twin(self) -> bool:
         """Whether a twin gets anything: an effect, or a force for the discrepancy."""
-        return not self.ranked_only and (bool(self.accepted) or self.search.discrepancy is not None)
+        return not self.ranked_only and (bool(self.accepted) or self.force_in_twin)
 
     @property
     def twin_fit(self) -> ModelFit:
-        """The fit that a twin is made of: with the force for the discrepancy if there is one."""
-        return self.search.discrepancy or self.after
+        """The fit that a twin is made of: with the force for the discrepancy if there is one that holds."""
+        force = self.search.discrepancy
+        return force if force is not None and self.force_in_twin else self.after

@@ -12,9 +12,9 @@ from masiv.inference.evidence import Evidence, predictive_p
 from masiv.inference.model_fit import ModelFit, rank_by_bic, refit_whitened, warm_started_fit
 from masiv.inference.robust import robust_scale_of
 from masiv.models.base import ForwardModel
-from masiv.refinement.candidates import score
-from masiv.refinement.effect_fit import BROYDEN_STEPS, fit_with_effect
-from masiv.refinement.hypotheses import Hypothesis, Posterior, linearized, log_prior, weighed
+from masiv.refinement.discrepancy import discrepancy_force
+from masiv.refinement.effect_fit import BROYDEN_STEPS
+from masiv.refinement.hypotheses import linearized, log_prior
 from masiv.refinement.limits import UpperLimit, sensitivity, upper_limit
 from masiv.refinement.rounds import Round, SearchResult
 from masiv.refinement.search_round import run_round
@@ -22,8 +22,6 @@ from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks
 from masiv.workers import TaskError
 
-DISCREPANCY_FORCE = "smooth_force"
-"""The effect that stands in for what no effect of the library explains."""
 MIN_ROBUST_SCALE = 5.0
 """Robust scale of the search over the noise of the noisiest observation, at the least: the whitened residual of an
 observation has its own ``noise_std``, and noise is no outlier in any of them."""
@@ -170,26 +168,3 @@ def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchS
         else:
             out.append(upper_limit(evidence, line, terms, model.term(name), here, found))
     return out
-
-
-def discrepancy_force(state: SearchState, settings: SearchSettings) -> ModelFit | None:
-    """``state.fit`` with a smooth force for what is not known; None if it is not probable either."""
-    label = "refine: a smooth force for the rest"
-    model = state.forward_model
-    ranking = score(
-        model, state.fit, [DISCREPANCY_FORCE], robust_scale=state.robust_scale,
-        progress=lambda n, i, k: settings.progress(label, i, k, n),
-    )  # fmt: skip
-    if not ranking.candidates:
-        return None
-    try:
-        fitted = fit_with_effect(model, state.fit, ranking.candidates[0], state.robust_scale)
-        hypotheses: list[Hypothesis] = weighed(
-            model, [state.fit, fitted], [linearized(model, state.fit), linearized(model, fitted)]
-        )
-    except MasivError as failed:
-        settings.progress(label, 1, 1, str(failed))
-        return None
-    settings.progress(label, 1, 1, f"{fitted.fit_mm:.1f} mm")
-    without = Posterior.of(hypotheses, 1).with_at_most(len(state.fit.model.effects))
-    return hypotheses[1].with_posterior() if without < settings.config.max_null_probability else None
