@@ -131,7 +131,7 @@ def oracle_of(case, config):
     best = fit_true_model(own, [best], case.law, case.contact, case.parameters, case.effects)
     own = with_residual_std(own, best, observation_std)
     best = fit_true_model(own, [best], case.law, case.contact, case.parameters, case.effects)
-    return {"case": case.name, "oracle": [best.fit_mm, best.held_out_mm], "seconds": [time.time() - began]}
+    return {"case": case.name, "oracle": [best.fit_mm, best.validation_mm], "seconds": [time.time() - began]}
 
 
 def refined(case, config):
@@ -151,14 +151,14 @@ def refined(case, config):
         "case": case.name,
         "true": {**case.effects, **case.outside},
         "verdict": refined.verdict,
-        "discrepancy_force": None if force is None else [force.fit_mm, force.held_out_mm],
+        "discrepancy_force": None if force is None else [force.fit_mm, force.validation_mm],
         "laws": [f.model.family.kind for f in fits],
         "noise_mm": 1e3 * observation.noise_std,
         "reduced_chi": [refined.reduced_chi(fit) for fit in (result.before, result.after)],
         "residual_std_mm": (1e3 * refined.observations[0].residual_std).round(1).tolist(),
         "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
         "trials": [
-            (t.law, t.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.log_bayes_factor, t.impossible)
+            (t.law, t.effect, round(t.fitted.fit_mm, 2), t.fitted.validation_mm, t.log_bayes_factor, t.impossible)
             for r in result.rounds for t in r.trials
         ],
         "accepted": list(accepted),
@@ -169,8 +169,8 @@ def refined(case, config):
         "values": result.after.values,
         "stderr": result.after.stderr,
         "null_probability": result.null_probability,
-        "before": [result.before.fit_mm, result.before.held_out_mm],
-        "after": [result.after.fit_mm, result.after.held_out_mm],
+        "before": [result.before.fit_mm, result.before.validation_mm],
+        "after": [result.after.fit_mm, result.after.validation_mm],
         "seconds": [middle - began, end - middle],
     }  # fmt: skip
 

@@ -100,8 +100,8 @@ class RefineResult:
     @property
     def verdict(self) -> str:
         """ "unexplained residual" if so large a residual is improbable with nothing missing, whether an effect was
-        added or not; else "effect added"; "nothing missing" if that is more probable than not, and an effect would more
-        probably than not have been seen; else "cannot tell"; "ranked only" if none was fitted."""
+        added or not; else "effect added"; "nothing missing" if no effect and nothing unknown is more probable than not,
+        and most effects would have been seen; else "cannot tell"; "ranked only" if none was fitted."""
         if self.ranked_only:
             return RANKED
         if self.predictive_p["after"] < self.config.min_predictive_p:
@@ -110,12 +110,13 @@ class RefineResult:
             return ADDED
         visible = sum(limit.determined for limit in self.search.limits)
         seen = 2 * visible >= len(self.search.limits)
-        return NOTHING if seen and self.search.null_probability > 0.5 else CANNOT_TELL
+        nothing = self.search.null_probability > 0.5 and self.search.unknown_probability < 0.5
+        return NOTHING if seen and nothing else CANNOT_TELL
 
     @property
     def predictive_p(self) -> Mapping[str, float]:
-        """See ``SearchResult``; ``before`` and ``after``."""
-        return self.search.predictive_p or {"before": 1.0, "after": 1.0}
+        """See ``Check``; ``before`` and ``after``."""
+        return {name: check.p for name, check in self.search.checks.items()} or {"before": 1.0, "after": 1.0}
 
     @property
     def changes_twin(self) -> bool:
