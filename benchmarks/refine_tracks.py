@@ -89,8 +89,14 @@ def cases():
 
 def baseline_fits(case, config):
     """Simulation, experiment, and fits of laws without effects."""
-    import torch
     from track_cases import observed
+
+    return fits_of(*observed(case), case.fit_frames, config)
+
+
+def fits_of(scene, motion, fit_frames, config):
+    """The same of the ``motion`` of a ``scene``, of which ``fit_frames`` are fitted."""
+    import torch
 
     from masiv.checkpoint import Checkpoint
     from masiv.identification.config import IdentifyConfig
@@ -102,11 +108,9 @@ def baseline_fits(case, config):
     from masiv.workers import Workers
 
     torch.set_num_threads(1)
-    scene, motion = observed(case)
-    whole = SampledMotion(motion.positions, motion.times, motion.volume)
-    cut = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
+    cut = SampledMotion(motion.positions[:fit_frames], motion.times[:fit_frames], motion.volume)
     setup, coarse, coarser, initial_motion = prepare(
-        "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
+        "0", scene, cut, motion, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
     )
     simulation = FreeBodyModel([setup])
     problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.problem.frames))
