@@ -18,6 +18,7 @@ from refine_calibration import probability_below, row_of
 
 from masiv.inference.evidence import Evidence, strength_scales
 from masiv.inference.marginal_likelihood import SizePriors
+from masiv.inference.model_fit import gauss_newton_fit
 from masiv.models.base import effect_parameters
 from masiv.refinement.hypotheses import linearized
 
@@ -104,8 +105,6 @@ def test_probability_below_goes_with_the_mean_and_from_none_to_all(taichi):
     given = draws.draw("flights", 2, null_fraction=0.0, narrow=True)
     model, base = given.forward_model, given.baselines[0]
     term = model.term("quadratic_drag")
-    from masiv.inference.model_fit import gauss_newton_fit
-
     fit = gauss_newton_fit(model, base.model.with_effect(term.name), base.values, budget=40)
     line = linearized(model, fit)
     evidence = Evidence.of(model.observations, line.fields)
