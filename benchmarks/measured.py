@@ -140,19 +140,19 @@ def balls(source: Path) -> dict:
         for t in terms
     }  # fmt: skip
     return {
-        "accepted": list(result.after.model.effects), "own": own, "held_out_mm": rows,
+        "accepted": list(result.after.model.effects), "own": own, "validation_mm": rows,
         "refused": {n: b.objections for n, b in refined.bodies.items() if b.objections},
         "shared": [
             {"bodies": s.term.bodies,
              "values": {n: [v, s.fitted.stderr[n]] for n, v in s.fitted.values.items() if n.startswith(s.term.effect)},
              "spread": s.strength_std, "log_bayes_factor": s.log_bayes_factor,
-             "held_out_mm": alike(s.fitted.model, s.fitted.values, fitted=False)}
+             "validation_mm": alike(s.fitted.model, s.fitted.values, "hold_out")}
             for s in refined.shared
         ],
         "gravity_each": [9.8 * (1 + trap.values[p.name]) for p in each.parameters],
         "information_gain_of_gravity_each": result.before.bic(trap.samples) - trap.bic(trap.samples),
         "trials": {
-            n: {"fit_mm": t.fitted.fit_mm, "held_out_mm": t.fitted.held_out_mm, "impossible": list(t.impossible),
+            n: {"fit_mm": t.fitted.fit_mm, "validation_mm": t.fitted.validation_mm, "impossible": list(t.impossible),
                 "log_bayes_factor": t.log_bayes_factor}
             for n, t in first.items()
         },
@@ -234,7 +234,7 @@ def load(source: Path, youngs: float, viscosity: float, particles: int, courant:
         model = Model(family_of("neo_hookean", 1070, law), "none", effects)
         fitted = gauss_newton_fit(simulation, model, values, budget=60, held=held)
         rows.append({
-            "effect": name, "load52_a_mm": fitted.fit_mm, "load52_b_mm": fitted.held_out_mm,
+            "effect": name, "load52_a_mm": fitted.fit_mm, "load52_b_mm": fitted.validation_mm,
             "values": {n: [v, fitted.stderr.get(n)] for n, v in fitted.values.items()},
             "rollouts": simulation.rollouts, "seconds": time.perf_counter() - began,
         })  # fmt: skip
@@ -246,7 +246,7 @@ def _held(simulation, trials: dict, name: str) -> dict | None:
     if name not in trials:
         return None
     fitted = trials[name].fitted
-    return simulation.by_body(fitted.model, fitted.values, fitted=False)
+    return simulation.by_body(fitted.model, fitted.values, "hold_out")
 
 
 def main() -> None:

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 
 def oracle(simulation, result, *, law: str, contact: str, parameters: Mapping[str, float], effects: Mapping) -> dict:
-    """{fit_mm, held_out_mm, values} of ``fit_true_model`` from the initial states of refine's model without effects and
-    of its last one; {problem} if both diverge."""
+    """{fit_mm, validation_mm, values} of ``fit_true_model`` from the initial states of refine's model without effects
+    and of its last one; {problem} if both diverge."""
     from masiv.errors import MasivError
 
     starts = [result.before] if result.after is result.before else [result.before, result.after]
@@ -17,7 +17,7 @@ def oracle(simulation, result, *, law: str, contact: str, parameters: Mapping[st
     except MasivError as failed:
         return {"problem": str(failed)}
     found = {n: v for n, v in best.values.items() if "@" not in n}
-    return {"fit_mm": best.fit_mm, "held_out_mm": best.held_out_mm, "values": found}
+    return {"fit_mm": best.fit_mm, "validation_mm": best.validation_mm, "values": found}
 
 
 def fit_true_model(

@@ -1,153 +1,188 @@
-"""Are the probabilities of refine right? Closed-form flights with jitter and smooth errors, with and without drag.
+"""Are the probabilities of refine right? Motions whose truth is known, with one effect or none, searched in full.
 
-    python benchmarks/refine_calibration.py null --draws 1000 [--first 0]
-    python benchmarks/refine_calibration.py drag --draws 500 [--first 0]
+    python benchmarks/refine_calibration.py OUT.jsonl {flights|linear|mpm} --draws 1500 [--first 0] [--jobs 1]
+    python benchmarks/refine_calibration.py --table OUT.jsonl … [--diagram FILE.svg]
 
-A ball of 66 mm and 60 g is thrown at 3 to 8 m/s and followed for 40 frames at 60 Hz. Its errors are jitter of 1 mm and
-smooth errors of 0 to 3 times that, with a correlation time between two frames and the record. ``drag``: quadratic, 5e-4
-to 3e-2 /m, evenly in the logarithm. Every draw is searched by ``masiv.refinement.search`` in full.
+One JSON line a draw; draws that are in OUT are skipped, so that a stopped run goes on. Draws: ``calibration_draws.py``;
+statistics: ``calibration_table.py``. By default two draws of three have no effect and strengths are drawn from the
+prior of refine: then its probabilities should come true as often as they say.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
+import functools
 import json
-import math
-import tempfile
-from dataclasses import replace
+import multiprocessing
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
-import yaml
-from scipy.stats import beta
+from scipy.special import ndtr
 
-FRAMES, FPS, JITTER = 40, 60.0, 1e-3
-MASS, DIAMETER = 0.06, 0.066
-DRAGS = ("quadratic_drag", "linear_drag")
+sys.path.insert(0, str(Path(__file__).parent))
 
-
-def ball_tracks():
-    """A scene of one flight, whose values are replaced by those of a draw."""
-    from masiv.tracks.read import read_tracks
-
-    folder = Path(tempfile.mkdtemp())
-    times = np.arange(FRAMES) / FPS
-    rows = ["t,x,y,z", *(f"{t},{4 * t},{1 + 3 * t - 4.9 * t * t},{0.5 * t}" for t in times)]
-    (folder / "flight.csv").write_text("\n".join(rows))
-    scene = {
-        "layout": "tracks", "units": "m", "up_axis": "y",
-        "bodies": {"ball": {
-            "mass": MASS, "group": "balls",
-            "geometry": {"sphere": DIAMETER, "units": "m", "markers_at": {"centre": [0, 0, 0]}},
-        }},
-        "runs": [{"file": "flight.csv", "body": "ball", "use": "fit"}],
-        "columns": {"time": "t", "markers": {"centre": {"x": "x", "y": "y", "z": "z"}}},
-    }  # fmt: skip
-    (folder / "scene.yaml").write_text(yaml.safe_dump(scene))
-    return read_tracks(folder)
+NULL_FRACTION = 2 / 3
+"""Prior probability of no effect, of at most one (``masiv.refinement.hypotheses.log_prior``)."""
 
 
-def draw(tracks, run, seed, *, with_drag):
-    """The flight of draw ``seed``, and its drag [1/m]."""
-    from masiv.effects.catalogue import effect_named
-    from masiv.models.point_mass import PointMassModel, fly
+def row_of(source: str, null_fraction: float, narrow: bool, seed: int) -> dict:
+    """What refine says of a draw, and what is true."""
+    from calibration_draws import draw
 
-    rng = np.random.default_rng(seed)
-    drag = float(np.exp(rng.uniform(np.log(5e-4), np.log(3e-2)))) if with_drag else 0.0
-    speed, elevation, azimuth = rng.uniform(3, 8), rng.uniform(0.2, 1.1), rng.uniform(0, 2 * np.pi)
-    along = np.cos(elevation)
-    velocity = speed * np.array([along * np.cos(azimuth), np.sin(elevation), along * np.sin(azimuth)])
-    model = PointMassModel(tracks, [run])
-    members = [(effect_named("quadratic_drag"), np.array([drag]))] if drag else []
-    start = np.array([[[0.0, 1.0, 0.0], velocity]])
-    path = fly(model.frame, model.gravity, members, start, run.times, DIAMETER)[0]
-    length = float(np.exp(rng.uniform(np.log(2 / FPS), np.log(FRAMES / FPS))))
-    lags = np.abs(np.subtract.outer(run.times, run.times))
-    factor = np.linalg.cholesky(np.exp(-0.5 * (lags / length) ** 2) + 1e-9 * np.eye(FRAMES))
-    errors = rng.normal(size=path.shape) + rng.uniform(0, 3) * factor @ rng.normal(size=path.shape)
-    return replace(run, values=(path + JITTER * errors)[:, None]), drag
-
-
-def searched(tracks, run, drag):
-    """One row: what was named, with which probability, and the drag with its error."""
-    from masiv.identification.flights import fit_flights
-    from masiv.models.point_mass import PointMassModel
-    from masiv.refinement.config import RefineConfig
     from masiv.refinement.search_state import SearchSettings
     from masiv.refinement.stage import refine
 
-    model = PointMassModel(tracks, [run])
-    result = refine(model, [fit_flights(model)], SearchSettings.of(RefineConfig.model_validate({"max_effects": 1})))
-    body = model.drag_bodies["ball"]
-    per_coefficient = body.medium_density * math.pi * body.diameter**2 / (8 * body.mass)
-    row = {"drag": drag, "null": result.search.null_probability, "verdict": result.verdict,
-           "named": [t.effect for t in result.accepted]}  # fmt: skip
-    first = result.search.rounds[0]
-    row["credible"] = sorted(e for s in first.posterior.credible_set() for e in s) if first.posterior else []
-    name = "quadratic_drag.drag_coefficient"
-    if "quadratic_drag" in row["named"]:
-        row["value"], row["stderr"] = (x[name] * per_coefficient for x in (result.after.values, result.after.stderr))
-    row["limits"] = {x.effect: x.strength for x in result.search.limits}
-    if "quadratic_drag" in row["limits"]:
-        row["limits"]["quadratic_drag"] *= per_coefficient
-    return row
+    began = time.process_time()
+    given = draw(source, seed, null_fraction=null_fraction, narrow=narrow)
+    settings = SearchSettings.of(given.config, discrepancy_force=False)
+    result = refine(given.forward_model, given.baselines, settings)
+    search, named = result.search, [t.effect for t in result.accepted]
+    first = search.rounds[0]
+    sets = first.posterior.sets() if first.posterior else {frozenset(): 1.0}
+    credible = first.posterior.credible_set() if first.posterior else sets
+    row = {
+        "source": source, "seed": seed, "null_fraction": null_fraction, "narrow": narrow,
+        "effect": given.effect, "truth": given.truth, "verdict": result.verdict, "named": named,
+        "null": search.null_probability, "unknown": search.unknown_probability,
+        "predictive_p": result.predictive_p["after"],
+        "sets": {" + ".join(sorted(s)) or "none": p for s, p in sets.items()},
+        "credible": [" + ".join(sorted(s)) or "none" for s in credible],
+        "log_bayes_factors": {t.effect: t.log_bayes_factor for t in first.trials},
+        "found": {p.name: [result.after.values[p.name], result.after.stderr[p.name]]
+                  for t in result.accepted for p in t.strengths},
+        "limits": {x.effect: [x.strength, x.motion_mm, x.determined] for x in search.limits},
+        "posterior": posterior_of_truth(given, settings, first, result.forward_model) if given.effect else None,
+    }  # fmt: skip
+    return {**row, "seconds": time.process_time() - began}
 
 
-def interval(count, total):
-    """Clopper-Pearson interval of a share, 95 %."""
-    low = beta.ppf(0.025, count, total - count + 1) if count else 0.0
-    return low, beta.ppf(0.975, count + 1, total - count) if count < total else 1.0
+def posterior_of_truth(given, settings, first, forward_model) -> dict | None:
+    """The strengths of the true effect in the model that has it, whether or not it was named: their steps, fitted
+    values, posterior means and standard deviations, and the posterior probability of less than the truth. None if the
+    model cannot be simulated."""
+    from masiv.errors import MasivError
+    from masiv.inference.evidence import Evidence
+    from masiv.refinement.candidates import score
+    from masiv.refinement.effect_fit import fit_with_effect
+    from masiv.refinement.hypotheses import linearized
+    from masiv.refinement.search import whitened_start
+
+    fitted = next((t.fitted for t in first.trials if t.effect == given.effect), None)
+    try:
+        if fitted is None:
+            state, _ = whitened_start(given.forward_model, given.baselines, settings)
+            forward_model, scale = state.forward_model, state.robust_scale
+            candidate = score(forward_model, state.fit, [given.effect], robust_scale=scale).candidates[0]
+            fitted = fit_with_effect(forward_model, state.fit, candidate, scale)
+        line, base = linearized(forward_model, fitted), linearized(forward_model, first.base)
+    except (MasivError, IndexError):
+        return None
+    term = forward_model.term(given.effect)
+    best = min((line, fitted.cost), (base, first.base.cost), key=lambda pair: pair[1])[0]
+    evidence = Evidence.of(forward_model.observations, best.fields)
+    index = [[p.name for p in line.parameters].index(p.name) for p in term.strengths]
+    at = np.array([line.values[p.name] for p in term.strengths])
+    true = np.array([given.truth[p.name] for p in term.strengths])
+    pooled = evidence.marginal(line, [term])
+    mean, sd = at + pooled.mean[index], np.sqrt(np.diag(pooled.covariance)[index])
+    return {
+        "step": [p.step for p in term.strengths], "fitted": at.tolist(), "mean": mean.tolist(), "sd": sd.tolist(),
+        "below": probability_below(evidence, line, term, index, true - at).tolist(),
+    }  # fmt: skip
 
 
-def share(label, count, total):
-    low, high = interval(count, total)
-    print(f"{label}: {count} of {total}, {100 * count / max(total, 1):.1f} % ({100 * low:.1f} to {100 * high:.1f} %)")
+def probability_below(evidence, line, term, index, offset) -> np.ndarray:
+    """Posterior probability that strengths are less than ``offset`` (K,) beyond their fitted values, of the mixture
+    over scales of the prior and over whether something unknown acts; none is below its bound."""
+    from masiv.inference.error_model import ErrorModel
+    from masiv.inference.marginal_likelihood import SizePriors, marginal
+
+    blocks, priors = tuple(evidence.blocks(line)), evidence.priors(line, [term])
+    sizes = SizePriors.of(blocks)
+    parts, logs = [], []
+    for prior, own in ((2 / 3, sizes), (1 / 3, sizes.with_unknown(blocks))):
+        found = marginal(blocks, priors, own)
+        gram = _gram(ErrorModel(blocks, found.logs), priors.mean)
+        below, total = np.zeros(len(index)), np.zeros(len(index))
+        components = [_component(gram, precision) for precision in priors.precision]
+        highest = max(log for log, _, _ in components)
+        for log, mean, covariance in components:
+            m, s = (priors.mean + mean)[index], np.sqrt(np.diag(covariance)[index])
+            floor = -np.inf
+            if priors.positive is not None:
+                floor = (priors.mean[index] - m) / s  # strength zero
+            weight = np.exp(log - highest)
+            below += weight * np.maximum(ndtr((offset - m) / s) - ndtr(floor), 0)
+            total += weight * (1 - ndtr(floor))
+        parts.append(below / total)
+        logs.append(found.log_evidence + np.log(prior))
+    weights = np.exp(np.array(logs) - np.logaddexp.reduce(logs))
+    return weights @ np.array(parts)
 
 
-def summary(rows):
-    """What the page has."""
-    named = [r for r in rows if r["named"]]
-    if not rows[0]["drag"]:
-        share("named although nothing is there", len(named), len(rows))
-        share("verdict nothing missing", sum(r["verdict"] == "nothing missing" for r in rows), len(rows))
-        return
-    share("named", len(named), len(rows))
-    share("wrong name (no drag), of those named", sum(r["named"][0] not in DRAGS for r in named), len(named))
-    credible = sum("quadratic_drag" in r["credible"] for r in named)
-    share("true effect in the credible set, of those named", credible, len(named))
-    known = [r for r in named if "value" in r]
-    z = np.array([(r["value"] - r["drag"]) / r["stderr"] for r in known])
-    share("within 1 standard error", int((np.abs(z) < 1).sum()), len(z))
-    share("within 2 standard errors", int((np.abs(z) < 2).sum()), len(z))
-    left = [r for r in rows if "quadratic_drag" in r["limits"] and not r["named"]]
-    below = sum(r["drag"] <= r["limits"]["quadratic_drag"] for r in left)
-    share("below the upper limit, of those not named", below, len(left))
-    for low, high in itertools.pairwise(np.geomspace(5e-4, 3e-2, 7)):
-        own = [r for r in rows if low <= r["drag"] < high]
-        share(f"power, drag {low:.1e} to {high:.1e} /m", sum(bool(r["named"]) for r in own), len(own))
+def _gram(model, offset):
+    """(1 + P, 1 + P) of the residual at the prior mean and the derivatives, whitened."""
+    out = 0.0
+    data = [np.concatenate([(b.residual + b.jacobian @ offset)[:, :, None], b.jacobian], axis=2) for b in model.blocks]
+    for b, white in zip(model.blocks, model.whiten(data), strict=True):
+        rows = white.reshape(-1, white.shape[2])
+        out = out + b.weight * rows.T @ rows
+    return out
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", choices=("null", "drag"))
-    parser.add_argument("--draws", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
+def _component(gram, precision):
+    """Log density but for a constant, mean (P,) about the prior mean and covariance (P, P) of one component."""
+    covariance = np.linalg.inv(gram[1:, 1:] + np.diag(precision))
+    mean = -covariance @ gram[1:, 0]
+    log = 0.5 * (-mean @ gram[1:, 0] + np.linalg.slogdet(covariance)[1] + np.log(precision).sum())
+    return log, mean, covariance
+
+
+def rows_in(paths) -> list[dict]:
+    return [json.loads(line) for p in paths if p.exists() for line in p.read_text().splitlines()]
+
+
+def _start() -> None:
+    import torch
+
     from masiv import runtime
-    from masiv.observations.tracks import flight_observations
 
     runtime.start("cpu")
-    with runtime.torch_threads(1):
-        tracks = ball_tracks()
-        (run,) = flight_observations(tracks, "balls")
-        rows = []
-        for seed in range(given.first, given.first + given.draws):
-            rows.append(searched(tracks, *draw(tracks, run, seed, with_drag=given.kind == "drag")))
-    if given.json:
-        given.json.write_text("\n".join(map(json.dumps, rows)))
-    summary(rows)
+    torch.set_num_threads(1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", nargs="?", type=Path)
+    parser.add_argument("source", nargs="?", choices=("flights", "linear", "mpm"))
+    parser.add_argument("--draws", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
+    parser.add_argument("--null-fraction", type=float, default=NULL_FRACTION, help="part of the draws without effect")
+    parser.add_argument("--narrow", action="store_true", help="strengths evenly in the logarithm, not of the prior")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--table", type=Path, nargs="+", metavar="FILE", help="print the statistics of these rows")
+    parser.add_argument("--diagram", type=Path, help="with --table: where the reliability diagram goes (SVG or PNG)")
+    given = parser.parse_args()
+    if given.table:
+        from calibration_table import diagram, table
+
+        rows = rows_in(given.table)
+        print(table(rows))
+        if given.diagram:
+            diagram(rows, given.diagram)
+        return
+    if given.out is None or given.source is None:
+        parser.error("name a file for the rows and a source of draws, or give --table")
+    same = {"source": given.source, "null_fraction": given.null_fraction, "narrow": given.narrow}
+    done = {r["seed"] for r in rows_in([given.out]) if same.items() <= r.items()}
+    todo = [seed for seed in range(given.first, given.first + given.draws) if seed not in done]
+    function = functools.partial(row_of, given.source, given.null_fraction, given.narrow)
+    with multiprocessing.get_context("spawn").Pool(given.jobs, _start) as pool, given.out.open("a") as file:
+        for row in pool.imap_unordered(function, todo):
+            file.write(json.dumps(row) + "\n")
+            file.flush()
 
 
 if __name__ == "__main__":

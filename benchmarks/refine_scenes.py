@@ -84,7 +84,7 @@ def quiet(*_):
 
 
 def table(path):
-    print("| scene | true | ranked first | accepted | before, fitted / held out [mm] | after | oracle | s |")
+    print("| scene | true | ranked first | accepted | before, fitted / validation [mm] | after | oracle | s |")
     print("|---|---|---|---|---|---|---|---|")
     for line in Path(path).read_text().splitlines():
         r = json.loads(line)
@@ -96,8 +96,8 @@ def table(path):
         )
         pair = "{:.1f} / {:.1f}".format
         shown = " + ".join([r["run"], *r["second"]])
-        oracle = "–" if not best else best.get("problem") or pair(best["fit_mm"], best["held_out_mm"])
-        parts = ("fit", "held_out")
+        oracle = "–" if not best else best.get("problem") or pair(best["fit_mm"], best["validation_mm"])
+        parts = ("fit", "validation")
         before, after = ([d[k][part]["trajectory_rmse_mm"] for part in parts] for k in ("before", "after"))
         cells = (shown, ", ".join(r["true"]) or "none", ranked, values or d["verdict"], pair(*before), pair(*after),
                  oracle, f"{sum(r['seconds']):.0f}")  # fmt: skip

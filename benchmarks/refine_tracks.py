@@ -89,8 +89,14 @@ def cases():
 
 def baseline_fits(case, config):
     """Simulation, experiment, and fits of laws without effects."""
-    import torch
     from track_cases import observed
+
+    return fits_of(*observed(case), case.fit_frames, config)
+
+
+def fits_of(scene, motion, fit_frames, config):
+    """The same of the ``motion`` of a ``scene``, of which ``fit_frames`` are fitted."""
+    import torch
 
     from masiv.checkpoint import Checkpoint
     from masiv.identification.config import IdentifyConfig
@@ -102,11 +108,9 @@ def baseline_fits(case, config):
     from masiv.workers import Workers
 
     torch.set_num_threads(1)
-    scene, motion = observed(case)
-    whole = SampledMotion(motion.positions, motion.times, motion.volume)
-    cut = SampledMotion(motion.positions[: case.fit_frames], motion.times[: case.fit_frames], motion.volume)
+    cut = SampledMotion(motion.positions[:fit_frames], motion.times[:fit_frames], motion.volume)
     setup, coarse, coarser, initial_motion = prepare(
-        "0", scene, cut, whole, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
+        "0", scene, cut, motion, IdentifyConfig.model_validate({}), SimulatorConfig.model_validate({}), config
     )
     simulation = FreeBodyModel([setup])
     problem = BaselineProblem(coarse, coarser, min(initial_motion.last_frame + 2, coarse.problem.frames))
@@ -131,7 +135,7 @@ def oracle_of(case, config):
     best = fit_true_model(own, [best], case.law, case.contact, case.parameters, case.effects)
     own = with_residual_std(own, best, observation_std)
     best = fit_true_model(own, [best], case.law, case.contact, case.parameters, case.effects)
-    return {"case": case.name, "oracle": [best.fit_mm, best.held_out_mm], "seconds": [time.time() - began]}
+    return {"case": case.name, "oracle": [best.fit_mm, best.validation_mm], "seconds": [time.time() - began]}
 
 
 def refined(case, config):
@@ -151,14 +155,14 @@ def refined(case, config):
         "case": case.name,
         "true": {**case.effects, **case.outside},
         "verdict": refined.verdict,
-        "discrepancy_force": None if force is None else [force.fit_mm, force.held_out_mm],
+        "discrepancy_force": None if force is None else [force.fit_mm, force.validation_mm],
         "laws": [f.model.family.kind for f in fits],
         "noise_mm": 1e3 * observation.noise_std,
         "reduced_chi": [refined.reduced_chi(fit) for fit in (result.before, result.after)],
         "residual_std_mm": (1e3 * refined.observations[0].residual_std).round(1).tolist(),
         "ranked": [(c.effect, round(c.explained, 3)) for c in first.candidates[:6]] if first else [],
         "trials": [
-            (t.law, t.effect, round(t.fitted.fit_mm, 2), t.fitted.held_out_mm, t.log_bayes_factor, t.impossible)
+            (t.law, t.effect, round(t.fitted.fit_mm, 2), t.fitted.validation_mm, t.log_bayes_factor, t.impossible)
             for r in result.rounds for t in r.trials
         ],
         "accepted": list(accepted),
@@ -169,8 +173,8 @@ def refined(case, config):
         "values": result.after.values,
         "stderr": result.after.stderr,
         "null_probability": result.null_probability,
-        "before": [result.before.fit_mm, result.before.held_out_mm],
-        "after": [result.after.fit_mm, result.after.held_out_mm],
+        "before": [result.before.fit_mm, result.before.validation_mm],
+        "after": [result.after.fit_mm, result.after.validation_mm],
         "seconds": [middle - began, end - middle],
     }  # fmt: skip
 

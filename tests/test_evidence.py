@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from masiv.inference.error_covariance import BlockCovariance, ErrorBlock, matern52
-from masiv.inference.evidence import jitter_of
 from masiv.inference.marginal_likelihood import ParameterPriors, SizePriors, _Likelihood, marginal
 from masiv.inference.motion_modes import MotionModes, rotations_since_start
+from masiv.inference.segments import jitter_of
 
 
 @pytest.fixture

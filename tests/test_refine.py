@@ -41,9 +41,9 @@ def test_undeclared_drag_is_named_measured_and_confirmed():
     assert document["verdict"] == "effect added"
     assert [a["effect"] for a in document["accepted"]] == ["linear_drag"]
     assert document["accepted"][0]["theta"]["rate"] == pytest.approx(1.0, rel=0.1)
-    assert (
-        document["after"]["held_out"]["trajectory_rmse_mm"] < document["before"]["held_out"]["trajectory_rmse_mm"] / 3
-    )
+    before, after = (document[k]["validation"]["trajectory_rmse_mm"] for k in ("before", "after"))
+    assert after < before / 3
+    assert document["after"]["test"]["trajectory_rmse_mm"] < document["before"]["test"]["trajectory_rmse_mm"] / 3
     assert document["candidates"][0]["explained"] > 0.5
     assert refined.after.values["velocity_x@run"] == pytest.approx(VELOCITY[0], abs=0.05)
 

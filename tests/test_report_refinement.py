@@ -14,24 +14,26 @@ from masiv.report.sections.refinement import read_refined, refinement_section
 
 ERRORS = {
     "fit": {"frames": [0, 11], "trajectory_rmse_mm": 10.7, "chamfer_1e3mm2": 0.31},
-    "held_out": {"frames": [12, 15], "trajectory_rmse_mm": 40.2},
+    "validation": {"frames": [12, 15], "trajectory_rmse_mm": 40.2},
 }
 
 
 def document(**changes):
     refit = {
-        "law": "neo_hookean", "effect": "linear_drag", "explained": 0.81, "fit_rmse_mm": 4.2, "held_out_rmse_mm": 13.1,
+        "law": "neo_hookean", "effect": "linear_drag", "explained": 0.81, "fit_rmse_mm": 4.2,
+        "validation_rmse_mm": 13.1,
         "parameters": {"rate": {"value": 0.72, "stderr": 0.02}}, "log_bayes_factor": 900.0, "accepted": True,
         "converged": True, "impossible": [],
     }  # fmt: skip
     refused = refit | {"effect": "swirl", "accepted": False, "impossible": ["it <cannot> be"], "parameters": {}}
     whole = {
-        "schema": 3, "null_probability": 0.0021, "predictive_p": {"before": 0.004, "after": 0.6},
+        "schema": 4, "null_probability": 0.0021, "predictive_p": {"before": 0.004, "after": 0.6},
+        "unknown_probability": 0.03, "test": {"after": {"rmse_mm": 15.0, "expected_rmse_mm": 17.5, "log_density": 3.0}},
         "credible_set": [{"effects": ["linear_drag"], "probability": 0.97}],
         "upper_limits": [{"effect": "restitution", "scope": "all", "strength": 0.0345, "unit": "1", "motion_mm": 2.25,
-                          "determined": True}], "noise_floor_mm": 2.5, "discretization_mm": {"fit": 3.0, "held_out":
+                          "determined": True}], "noise_floor_mm": 2.5, "discretization_mm": {"fit": 3.0, "validation":
         4.0}, "grid_change": {"before": 0.4, "after": 0.625},
-        "residual_mm": {"fit": 10.7, "held_out": 40.2},
+        "residual_mm": {"fit": 10.7, "validation": 40.2},
         "candidates": [
             {"effect": "linear_drag", "explained": 0.81, "theta": 0.7, "unit": "1/s", "stderr": 0.02,
              "parameters": {"rate": 0.7}, "probability": 0.97, "looks_like": "slows & slows"},
@@ -40,7 +42,7 @@ def document(**changes):
                       "unit": {"rate": "1/s"}, "indistinguishable_from": ["quadratic_drag"]}],
         "before": ERRORS,
         "after": {"fit": ERRORS["fit"] | {"trajectory_rmse_mm": 4.2},
-                  "held_out": ERRORS["held_out"] | {"trajectory_rmse_mm": 13.1}},
+                  "validation": ERRORS["validation"] | {"trajectory_rmse_mm": 13.1}},
         "unexplained": {"rmse_mm": 5.0, "noise_floor_mm": 2.5, "worst_time_s": 0.6, "worst_instant_rmse_mm": 14.0,
                         "rmse_mm_by_instant": {"run": [1.0]}, "worst_place_at_start_m": [0.1, 0.2, 0.3],
                         "worst_place_rmse_mm": 9.0},
@@ -104,7 +106,7 @@ def test_numbers_and_pictures_of_an_accepted_effect(tmp_path):
 
 
 def test_nothing_found(tmp_path):
-    alone = {"fit": ERRORS["fit"], "held_out": {}}
+    alone = {"fit": ERRORS["fit"], "validation": {}}
     found = document(accepted=[], candidates=[], rounds=[], next_experiment=None, before=alone, after=alone,
                      verdict="nothing missing", grid_change={"before": None, "after": None})  # fmt: skip
     write(tmp_path, found, fields(instants=12, fitted=12))
@@ -120,7 +122,7 @@ def test_a_discrepancy_force_is_no_cause(tmp_path):
         "stderr": {},
         "unit": {},
         "fit_rmse_mm": 3.25,
-        "held_out_rmse_mm": 9.75,
+        "validation_rmse_mm": 9.75,
     }
     write(tmp_path, document(accepted=[], verdict="unexplained residual", discrepancy_force=force), fields())
     section = section_of(tmp_path)
@@ -145,7 +147,7 @@ def test_fields_of_one_instant_and_of_no_residual():
     one = np.zeros((1, 8, 3), dtype=np.float32)
     points = np.random.default_rng(1).uniform(size=(8, 3))
     for png in (
-        plots.residual_in_time({"before": one}, np.array([0.1]), 1, 1.0),
+        plots.residual_in_time({"before": one}, np.array([0.1]), 1, 0, 1.0),
         plots.residual_in_space({"before": one}, points, np.array([0.1])),
     ):
         assert png.startswith(b"\x89PNG")

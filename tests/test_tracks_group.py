@@ -52,7 +52,7 @@ def test_one_coefficient_where_all_share_it(tmp_path):
     name = "quadratic_drag.drag_coefficient"
     assert after.values[name] == pytest.approx(0.47, abs=max(4 * after.stderr[name], 0.005))
     assert after.stderr[name] < 0.05
-    assert after.held_out_mm < 15
+    assert after.validation_mm < 15
 
 
 def test_own_coefficients_and_a_body_that_lacks_nothing(tmp_path):
@@ -109,7 +109,7 @@ def test_measured_balls():
     assert sorted(after.model.effects) == [
         "quadratic_drag@Tennis Ball", "quadratic_drag@Whiffle Ball 1", "quadratic_drag@Yellow Whiffle Ball"
     ]  # fmt: skip
-    errors = refined.forward_model.by_body(after.model, after.values, fitted=False)
+    errors = refined.forward_model.by_body(after.model, after.values, "hold_out")
     assert errors["Tennis Ball"] < 350
     assert errors["Whiffle Ball 1"] < 300
     assert errors["Bowling Ball"] == pytest.approx(91, abs=2)

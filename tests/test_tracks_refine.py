@@ -129,8 +129,8 @@ def test_damping_is_found_and_the_law_with_it(bar):
     assert after.model.effects == ("viscosity",)
     assert after.values["youngs_modulus"] == pytest.approx(YOUNGS, rel=0.02)
     assert after.values["viscosity.viscosity"] == pytest.approx(VISCOSITY, rel=0.1)
-    assert after.held_out_mm < 0.1
-    assert after.held_out_mm < 0.25 * result.before.held_out_mm
+    assert after.validation_mm < 0.1
+    assert after.validation_mm < 0.25 * result.before.validation_mm
     drag = [t for t in result.search.rounds[0].trials if t.effect == "linear_drag"]
     assert [any("it takes a medium of" in why for why in t.impossible) for t in drag] == [True]
 
@@ -146,7 +146,7 @@ def test_load_is_a_mass_at_the_tip_and_no_force(bar):
     after = result.after
     assert after.model.effects == ("viscosity", "point_mass")
     assert after.values["point_mass.mass"] == pytest.approx(LOAD, rel=0.05)
-    assert after.held_out_mm < 0.2 < 0.1 * result.before.held_out_mm
+    assert after.validation_mm < 0.2 < 0.1 * result.before.validation_mm
     share = {c.effect: c.explained for c in result.search.rounds[0].candidates}
     assert 1 - share["point_mass"] < 0.2 * (1 - share["gravity_scale"])
 
@@ -167,7 +167,7 @@ def test_one_body_from_its_law_to_its_twin(bar, tmp_path):
     assert result.places == {}
     written = document(result)
     assert [(o["observation"], list(o["after_mm"])) for o in written["observations"]] == [
-        ("own_a", ["fit"]), ("own_b", ["held_out"])
+        ("own_a", ["fit"]), ("own_b", ["validation"])
     ]  # fmt: skip
     assert set(arrays(result)) >= {"observed@own_a", "before@own_b", "after@own_b", "times@own_a"}
     again = refine_tracks(bar, twin, config, TRACKS, SIMULATOR, folder=tmp_path)

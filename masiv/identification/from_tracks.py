@@ -111,4 +111,4 @@ def _kinds(law: str) -> tuple[str, ...]:
 
 def errors_mm(fitted: ModelFit) -> dict[str, float | None]:
     """Root mean square distances of a fit [mm], as twin.yaml holds them."""
-    return {"fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm}
+    return {"fit_rmse_mm": fitted.fit_mm, "validation_rmse_mm": fitted.validation_mm}

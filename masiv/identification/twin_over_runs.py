@@ -63,6 +63,6 @@ def simulate_runs(
 def run_errors(runs: Sequence[TracksObservation], fields: Sequence[np.ndarray]) -> list[dict[str, Any]]:
     """Root mean square distance [mm] of each run, from its residuals (T, N, A) [m]."""
     return [
-        {"run": run.name, "use": "fit" if run.fitted else "hold_out", "rmse_mm": rms_mm([f]), "instants": len(f)}
+        {"run": run.name, "use": run.purpose, "rmse_mm": rms_mm([f]), "instants": len(f)}
         for run, f in zip(runs, fields, strict=True)
     ]

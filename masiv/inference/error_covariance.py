@@ -29,7 +29,8 @@ class ErrorBlock:
     residual (T, K) [m]; jacobian (T, K, P) by the fitted scales of P parameters; lags (T, T) [s]. group: index of the
     mode group. jitter [m]: expected jitter of a coefficient; smooth (T,) [m]: expected size of smooth errors of a
     coefficient; grid (T,) [m]: what another grid would change in it, zero if there is none. grid_length [s]. weight:
-    power of the block's likelihood, below 1 if its modes are not independent of each other.
+    power of the block's likelihood, below 1 if its modes are not independent of each other. motion: size of the motion
+    over that of smooth errors, which errors cannot exceed.
     """
 
     residual: np.ndarray
@@ -41,6 +42,7 @@ class ErrorBlock:
     grid: np.ndarray
     grid_length: float
     weight: float = 1.0
+    motion: float = 1e3
 
 
 @dataclass(frozen=True)

@@ -46,13 +46,18 @@ class ParameterPriors:
 @dataclass(frozen=True)
 class Marginal:
     """log_evidence: logarithm of the marginal likelihood. mean, covariance: of the parameters less their fitted values,
-    (P,) and (P, P), over the mixture. weights (S,): posterior of the mixture's components. sizes: of the errors."""
+    (P,) and (P, P), over the mixture. logs (3 G + 1,): logarithms of the sizes of the errors (``ErrorSizes``). unknown:
+    posterior probability that something unknown acts as well."""
 
     log_evidence: float
     mean: np.ndarray
     covariance: np.ndarray
-    weights: np.ndarray
-    sizes: ErrorSizes
+    logs: np.ndarray
+    unknown: float = 0.0
+
+    @property
+    def sizes(self) -> ErrorSizes:
+        return ErrorSizes.of_logarithms(self.logs)
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,17 @@ class SizePriors:
         mean = np.concatenate([np.zeros(2 * groups), lengths, [0.0]])
         sd = np.concatenate([np.full(groups, JITTER_SD), np.full(groups, SMOOTH_SD), spreads, [GRID_SD]])
         return cls(mean, sd)
+
+    def with_unknown(self, blocks: Sequence[ErrorBlock]) -> SizePriors:
+        """If something unknown acts: it moves the body smoothly, by anything between an error and the whole motion
+        (a discrepancy of the model; Kennedy & O'Hagan 2001)."""
+        groups = len(self.mean) // 3
+        largest = [max(b.motion for b in blocks if b.group == g) for g in range(groups)]
+        half = 0.5 * np.log(largest)
+        mean, sd = self.mean.copy(), self.sd.copy()
+        mean[groups : 2 * groups] = half
+        sd[groups : 2 * groups] = np.maximum(half, SMOOTH_SD)
+        return SizePriors(mean, sd)
 
     def starts(self) -> list[np.ndarray]:
         """Sizes from which their fit begins: as expected, rough, smooth, and with more of another grid."""
@@ -198,12 +214,25 @@ def marginal(blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizeP
     volume = -0.5 * np.linalg.slogdet(hessian * np.outer(sizes.sd, sizes.sd))[1]
     terms = likelihood.terms(found.x)
     weights = np.exp(terms.logp - np.logaddexp.reduce(terms.logp))
-    mean = weights @ terms.mean
-    apart = terms.mean - mean
-    spread = np.tensordot(weights, terms.covariance + apart[:, :, None] * apart[:, None, :], 1)
-    return Marginal(
-        -float(found.fun) + float(volume), priors.mean + mean, spread, weights, ErrorSizes.of_logarithms(found.x),
-    )  # fmt: skip
+    mean, spread = _moments(weights, terms.mean, terms.covariance)
+    return Marginal(-float(found.fun) + float(volume), priors.mean + mean, spread, found.x)
+
+
+def _moments(weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (P,) and covariance (P, P) of a mixture of components with ``weights`` (S,)."""
+    mean = weights @ means
+    apart = means - mean
+    return mean, np.tensordot(weights, covariances + apart[:, :, None] * apart[:, None, :], 1)
+
+
+def with_unknown(without: Marginal, unknown: Marginal) -> Marginal:
+    """Over whether something unknown acts, which is half as likely as that it does not (as one effect more is)."""
+    logs = np.array([without.log_evidence + math.log(2 / 3), unknown.log_evidence + math.log(1 / 3)])
+    total = float(np.logaddexp.reduce(logs))
+    weights = np.exp(logs - total)
+    parts = (without, unknown)
+    mean, spread = _moments(weights, np.stack([m.mean for m in parts]), np.stack([m.covariance for m in parts]))
+    return Marginal(total, mean, spread, parts[int(weights.argmax())].logs, float(weights[1]))
 
 
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]

@@ -27,6 +27,8 @@ from masiv.models.base import ForwardModel, Model
 from masiv.models.parameters import Parameter
 from masiv.observations.base import Observation, rms_mm
 
+PARTS = ("fit", "validation", "test")
+"""Of the instants, see ``Observation.parts``."""
 STRENGTH_FACTORS = (0.25, 1.0, 4.0)
 """Factors of a strength that the linear model promised, which are tried if it misled."""
 
@@ -35,9 +37,9 @@ STRENGTH_FACTORS = (0.25, 1.0, 4.0)
 class ModelFit:
     """A model with its parameters. residual (M,) [m] of the fitted instants, whitened; jacobian (M, P) of it.
 
-    cost [m²]: robust mean square; samples: independent residuals. fit_mm and held_out_mm: root mean square distance,
-    not whitened; held_out_mm is None if nothing is held out. fields: of each observation, simulated less observed
-    (T, N, A) [m] at all instants. stderr: by name, of the fitted parameters.
+    cost [m²]: robust mean square; samples: independent residuals. fit_mm, validation_mm and test_mm: root mean square
+    distance over these instants (``Observation.parts``), not whitened; None if there are none. fields: of each
+    observation, simulated less observed (T, N, A) [m] at all instants. stderr: by name, of the fitted parameters.
     """
 
     model: Model
@@ -48,7 +50,8 @@ class ModelFit:
     cost: float
     samples: int
     fit_mm: float
-    held_out_mm: float | None
+    validation_mm: float | None
+    test_mm: float | None
     fields: list[np.ndarray]
     stderr: dict[str, float]
 
@@ -76,12 +79,12 @@ def rank_by_bic(fits: Sequence[ModelFit]) -> list[ModelFit]:
     return sorted(fits, key=lambda f: f.bic(samples))
 
 
-def split_fields(
-    fields: Sequence[np.ndarray], observations: Sequence[Observation]
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Fitted and held-out instants of fields over all instants."""
-    fit = [f[: e.fit_count] for f, e in zip(fields, observations, strict=True)]
-    return fit, [f[e.fit_count :] for f, e in zip(fields, observations, strict=True) if e.holds_out]
+def part_mm(fields: Sequence[np.ndarray], observations: Sequence[Observation], part: str) -> float | None:
+    """Root mean square distance [mm] of fields over all instants, on a part of them (``Observation.parts``); None if
+    there is none."""
+    pairs = zip(fields, observations, strict=True)
+    own = [f[e.parts[part]] for f, e in pairs if part in e.parts]
+    return rms_mm(own) if own else None
 
 
 @dataclass(frozen=True)
@@ -116,10 +119,10 @@ def evaluate_fit(
     jacobian: np.ndarray, *, robust_scale: float,
 ) -> ModelFit:  # fmt: skip
     """``ModelFit`` of given values: one rollout over all instants; standard errors from ``jacobian`` (M, P)."""
-    noise = NoiseModel(forward_model.observations)
+    observations = forward_model.observations
+    noise = NoiseModel(observations)
     fields = forward_model.fields(model, values, held_out=True)
-    fit, rest = split_fields(fields, forward_model.observations)
-    whitened = noise.whiten(fit)
+    whitened = noise.whiten([f[: e.fit_count] for f, e in zip(fields, observations, strict=True)])
     residual = np.concatenate([f.ravel() for f in whitened])
     samples = noise.effective_samples(whitened)
     weight = soft_l1_weight(residual, robust_scale)
@@ -127,7 +130,8 @@ def evaluate_fit(
     inflation = max(len(residual) - len(parameters), 1) / max(samples - len(parameters), 1)
     return ModelFit(
         model, dict(values), tuple(parameters), residual, jacobian, soft_l1_mean_square(residual, robust_scale),
-        samples, rms_mm(fit), rms_mm(rest) if rest else None, fields,
+        samples, part_mm(fields, observations, "fit") or 0.0, part_mm(fields, observations, "validation"),
+        part_mm(fields, observations, "test"), fields,
         standard_errors(parameters, values, variances * inflation),
     )  # fmt: skip
 

@@ -228,12 +228,12 @@ class PointMassModel(ForwardModel):
             for run in self.observations
         ]
 
-    def by_body(self, model: Model, values: Mapping[str, float], *, fitted: bool) -> dict[str, float]:
-        """Error [mm] of each body over its runs that are fitted, or that are held out."""
+    def by_body(self, model: Model, values: Mapping[str, float], purpose: str) -> dict[str, float]:
+        """Error [mm] of each body over its runs of that ``purpose`` (fit, hold_out or test)."""
         fields = self.fields(model, values, held_out=True)
         own: dict[str, list[np.ndarray]] = {}
         for run, field in zip(self.observations, fields, strict=True):
-            if run.fitted == fitted:
+            if run.purpose == purpose:
                 own.setdefault(run.body, []).append(field)
         return {body: rms_mm(found) for body, found in own.items()}
 

@@ -10,7 +10,9 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """N points of one recording at T instants, of which the first ``fit_count`` are fitted and the rest is held out.
+    """N points of one recording at T instants. The first ``fit_count`` are fitted. The last ``test_count`` are seen by
+    no decision: errors are reported on them. Those between are for validation: with the fitted ones they decide which
+    law and effects act.
 
     name: of the recording, different from those that it is fitted with. times (T,) [s], ascending. points (N, 3) [m]:
     where the points are at the start, in the axes of ``values``. values (T, N, A) [m]: what was measured in A axes, NaN
@@ -31,6 +33,7 @@ class Observation:
     residual_std: np.ndarray
     observation_std: np.ndarray = field(default_factory=lambda: np.zeros(0))
     grid_corrections: tuple[np.ndarray, ...] = ()
+    test_count: int = 0
 
     def __post_init__(self) -> None:
         if not len(self.observation_std):
@@ -48,6 +51,11 @@ class Observation:
                 raise ValueError(f"observation {self.name}: {name} has shape {array.shape}, it must be {shape}")
         if not 0 <= self.fit_count <= instants:
             raise ValueError(f"observation {self.name}: fit_count {self.fit_count} is not within 0 and {instants}")
+        if not 0 <= self.test_count <= instants - self.fit_count:
+            raise ValueError(
+                f"observation {self.name}: test_count {self.test_count} is not within 0 and the "
+                f"{instants - self.fit_count} instants that are not fitted"
+            )
 
     @property
     def time_count(self) -> int:
@@ -55,9 +63,22 @@ class Observation:
         return len(self.times)
 
     @property
-    def holds_out(self) -> bool:
-        """Whether some instants are not fitted."""
-        return self.fit_count < self.time_count
+    def decided_count(self) -> int:
+        """How many instants take part in decisions: those that are not for the test."""
+        return self.time_count - self.test_count
+
+    @property
+    def parts(self) -> dict[str, slice]:
+        """Of the instants: ``fit``, ``validation`` and ``test``, those that are not empty."""
+        ends = {"fit": (0, self.fit_count), "validation": (self.fit_count, self.decided_count),
+                "test": (self.decided_count, self.time_count)}  # fmt: skip
+        return {name: slice(*pair) for name, pair in ends.items() if pair[0] < pair[1]}
+
+    @property
+    def extent(self) -> float:
+        """How far the motion goes along the axis where it goes farthest [m], but for the test."""
+        values = self.values[: self.decided_count]
+        return float(np.nanmax(np.nanmax(values, (0, 1)) - np.nanmin(values, (0, 1)))) if len(values) else 0.0
 
     @property
     def grid_correction(self) -> np.ndarray:

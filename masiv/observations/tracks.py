@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ FLIGHT_DEGREE = 6
 
 @dataclass(frozen=True, kw_only=True)
 class TracksObservation(Observation):
-    """A run from its release (or first frame) on. All of its instants are fitted, or all are held out.
+    """A run from its release (or first frame) on: all of it is fitted, or is for validation, or for the test.
 
     body, condition: as in the scene. axes: which of x, y, z were measured. skipped [s]: time after the release that is
     left out.
@@ -42,14 +43,24 @@ class TracksObservation(Observation):
         out[..., list(self.axes)] = self.values
         return out
 
+    @property
+    def purpose(self) -> str:
+        """As a scene declares it: fit, hold_out or test."""
+        return "fit" if self.fitted else "test" if self.test_count else "hold_out"
+
     def shortened(self, duration: float) -> TracksObservation:
         """The first ``duration`` [s] of what is compared."""
         kept = self.times <= self.skipped + duration
         count = int(kept.sum())
         return replace(
             self, times=self.times[kept], values=self.values[kept], residual_std=self.residual_std[kept],
-            observation_std=self.observation_std[kept], fit_count=count if self.fitted else 0,
+            observation_std=self.observation_std[kept], **_counts(self.purpose, count),
         )  # fmt: skip
+
+
+def _counts(purpose: str, count: int) -> dict[str, Any]:
+    """How many of ``count`` instants of a run are fitted, and how many are for the test."""
+    return {"fit_count": count if purpose == "fit" else 0, "test_count": count if purpose == "test" else 0}
 
 
 def marker_observation(
@@ -63,8 +74,8 @@ def marker_observation(
         noise = max(float(np.sqrt((run.noise_std[list(markers)] ** 2).sum(1).mean())), MIN_NOISE)
     return TracksObservation(
         name=run.name, times=times, points=points, values=positions,
-        fit_count=len(times) if run.purpose == "fit" else 0, noise_std=noise, residual_std=np.full(len(times), noise),
-        body=run.body, condition=run.condition, axes=(0, 1, 2), skipped=skipped,
+        noise_std=noise, residual_std=np.full(len(times), noise), body=run.body, condition=run.condition,
+        axes=(0, 1, 2), skipped=skipped, **_counts(run.purpose, len(times)),
     )  # fmt: skip
 
 
@@ -100,8 +111,8 @@ def _flight(tracks: Tracks, run: Run) -> TracksObservation:
     noise = flight_noise(times, places)
     return TracksObservation(
         name=run.name, times=times, points=np.zeros((1, 3)), values=places[:, None],
-        fit_count=len(times) if run.purpose == "fit" else 0, noise_std=noise, residual_std=np.full(len(times), noise),
-        body=run.body, condition=run.condition, axes=axes,
+        noise_std=noise, residual_std=np.full(len(times), noise), body=run.body, condition=run.condition, axes=axes,
+        **_counts(run.purpose, len(times)),
     )  # fmt: skip
 
 

@@ -16,6 +16,8 @@ from masiv.runfolder import RunFolder, load_motion
 from masiv.scene.scene import Scene
 
 if TYPE_CHECKING:
+    from masiv.observations.motion import Observed
+    from masiv.observations.video import VideoObservation
     from masiv.pipeline.video import VideoRun
     from masiv.refinement.from_video import Recording
     from masiv.refinement.result import RefineResult
@@ -62,6 +64,7 @@ def recording_of(run: VideoRun, progress: Progress) -> Recording:
 def _save(
     run: VideoRun, recording: Recording, result: RefineResult, twin: Twin, request: RefineRequest, progress: Progress
 ) -> dict[str, Any]:
+    from masiv.observations.video import VideoObservation
     from masiv.refinement.document import document as document_of
     from masiv.refinement.document import save_arrays
     from masiv.refinement.to_twin import baseline_twin, refined_twin
@@ -80,8 +83,11 @@ def _save(
         name: simulate(model, frames=scene.frame_count, fps=scene.fps, progress=progress).positions
         for name, model in (("before", old), ("after", new))
     }
+    observation = result.observations[0]
+    assert isinstance(observation, VideoObservation)
     for name, positions in rollouts.items():
-        for split, numbers in _picture_errors(scene, dynamic, positions, recording, progress).items():
+        errors = _picture_errors(scene, dynamic, positions, recording.whole, observation, progress)
+        for split, numbers in errors.items():
             document[name][split] |= numbers
     if request.dry_run:
         write_json(folder.path / "refine.dry_run.json", document)
@@ -148,9 +154,11 @@ def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: P
 
 
 def _picture_errors(
-    scene: Scene, dynamic: DynamicGaussians, positions: np.ndarray, recording: Recording, progress: Progress
-) -> dict[str, dict[str, Any]]:
-    """Chamfer to the observed motion, and pictures against the video, over fitted and held-out frames."""
+    scene: Scene, dynamic: DynamicGaussians, positions: np.ndarray, motion: Observed, observation: VideoObservation,
+    progress: Progress,
+) -> dict[str, dict[str, Any]]:  # fmt: skip
+    """Chamfer to the ``motion`` that was followed, and pictures against the video, over the frames of each part of
+    ``observation``."""
     from masiv import metrics
     from masiv.report import measure
     from masiv.report.follow import Binding
@@ -158,15 +166,12 @@ def _picture_errors(
     binding = Binding.at_rest(dynamic.at(0.0), positions[0])
     views = list(range(len(scene.cameras)))
     out: dict[str, dict[str, Any]] = {}
-    for split, frames in (
-        ("fit", list(range(1, recording.fit_frames))),
-        ("held_out", list(range(recording.fit_frames, scene.frame_count))),
-    ):
-        if not frames:
-            continue
+    samples = observation.samples_per_frame
+    for done, (split, part) in enumerate(observation.parts.items()):
+        frames = list(range(1 + part.start // samples, 1 + part.stop // samples))
         numbers = measure.picture_numbers(scene, lambda f: binding.moved(positions[f]), views, frames) or {}
         kept = {k: numbers[k] for k in ("psnr_db", "psnr_box_in_scene_db", "ssim", "mask_iou") if k in numbers}
-        chamfer = [metrics.chamfer_1e3mm2(positions[f], recording.whole.positions[f]) for f in frames]
+        chamfer = [metrics.chamfer_1e3mm2(positions[f], motion.positions[f]) for f in frames]
         out[split] = {"frames": frames, "chamfer_1e3mm2": float(np.mean(chamfer)), **kept}
-        progress("refine: pictures", 1 if split == "fit" else 2, 2)
+        progress("refine: pictures", done + 1, len(observation.parts))
     return out

@@ -85,7 +85,7 @@ class TracksRun(Run):
                     folder=self._rollout_cache, progress=progress,
                 )  # fmt: skip
                 families = [
-                    {"law": f.model.family.kind, "fit_rmse_mm": f.fit_mm, "held_out_rmse_mm": f.held_out_mm}
+                    {"law": f.model.family.kind, "fit_rmse_mm": f.fit_mm, "validation_rmse_mm": f.validation_mm}
                     for f in fits
                 ]
                 twin.save(self.path)
@@ -166,6 +166,7 @@ class TracksRun(Run):
         numbers = {
             "fit": [r for r in rows if r["use"] == "fit"],
             "held_out": [r for r in rows if r["use"] == "hold_out"],
+            "test": [r for r in rows if r["use"] == "test"],
             "unit": "mm",
         }
         write_json(self.folder.evaluation, numbers)

@@ -46,6 +46,11 @@ class RefineConfig(BaseModel):
         description="probability of a residual as large as that of the final model, below which it is unexplained "
         "(prior predictive check)",
     )  # fmt: skip
+    test_fraction: float = Field(
+        0.5, ge=0, lt=1,
+        description="part of the frames that are not fitted, the last ones, which no decision sees: errors before and "
+        "after are reported on them",
+    )  # fmt: skip
     tracking_error: float = Field(
         0.4, ge=0, le=1,
         description="error of points that are followed in pictures, over their distance from a rigid motion",

@@ -11,7 +11,7 @@ import torch
 
 from masiv.effects.places import farthest_points
 from masiv.effects.smooth_force import STRENGTHS, acceleration
-from masiv.inference.model_fit import split_fields
+from masiv.inference.model_fit import PARTS, split_fields
 from masiv.refinement.discrepancy import DISCREPANCY_FORCE
 from masiv.refinement.result import RefineResult
 
@@ -80,7 +80,7 @@ def peak(fields: Sequence[SampledField]) -> dict[str, Any] | None:
 
 
 def share(result: RefineResult) -> dict[str, float | None]:
-    """Part of the residual's sum of squares that the force removes, over the fitted and over the held-out instants;
+    """Part of the residual's sum of squares that the force removes, over the fitted, validation and test instants;
     negative if it adds to it; None if there are no such instants."""
     fitted = result.search.discrepancy
     assert fitted is not None
@@ -91,4 +91,4 @@ def share(result: RefineResult) -> dict[str, float | None]:
 
     before = split_fields(result.after.fields, result.observations)
     after = split_fields(fitted.fields, result.observations)
-    return {"fit": part(before[0], after[0]), "held_out": part(before[1], after[1])}
+    return {name: part(*fields) for name, *fields in zip(PARTS, before, after, strict=True)}

@@ -11,7 +11,8 @@ import numpy as np
 
 from masiv.effects.catalogue import effect_named
 from masiv.files import write_npz
-from masiv.inference.model_fit import ModelFit, split_fields
+from masiv.inference.model_fit import PARTS, ModelFit, part_mm
+from masiv.inference.predictive import Forecast
 from masiv.models.base import EffectTerm
 from masiv.models.free_body import GRID_CORRECTION
 from masiv.observations.base import rms_mm
@@ -23,7 +24,7 @@ from masiv.refinement.limits import UpperLimit
 from masiv.refinement.result import ADDED, NOTHING, RANKED, BodyResult, Proposal, RefineResult, SharedFit
 from masiv.refinement.rounds import Round, Trial, alternatives
 
-SCHEMA = 3
+SCHEMA = 4
 WORST_POINTS = 0.1
 """Part of the points whose middle is the place where a residual is largest."""
 
@@ -40,9 +41,11 @@ def document(result: RefineResult) -> dict[str, Any]:
         "discretization_mm": _discretization_mm(result),
         "grid_change": {"before": _grid_change(result, before), "after": _grid_change(result, after)},
         "reduced_chi": {"before": result.reduced_chi(before), "after": result.reduced_chi(after)},
-        "residual_mm": {"fit": before.fit_mm, "held_out": before.held_out_mm},
+        "residual_mm": {"fit": before.fit_mm, "validation": before.validation_mm},
         "null_probability": result.search.null_probability,
+        "unknown_probability": result.search.unknown_probability,
         "predictive_p": dict(result.predictive_p),
+        "test": {name: _test(check.test) for name, check in result.search.checks.items() if check.test},
         "credible_set": _credible_set(first),
         "upper_limits": [_upper_limit(result, limit) for limit in result.search.limits],
         "candidates": [_candidate(result, c, first) for c in first.candidates] if first else [],
@@ -77,15 +80,13 @@ def _short(term: EffectTerm, name: str) -> str:
 
 
 def _discretization_mm(result: RefineResult) -> dict[str, float | None]:
-    """By how much one grid more may differ, root mean square [mm] over the fitted and the held-out instants."""
-    parts = [(e.residual_std**2 - e.noise_std**2, e.fit_count) for e in result.observations]
-    fit = np.concatenate([variance[:count] for variance, count in parts])
-    rest = np.concatenate([variance[count:] for variance, count in parts])
+    """By how much one grid more may differ, root mean square [mm] over the instants of each part."""
 
-    def root(variance: np.ndarray) -> float | None:
-        return 1e3 * math.sqrt(max(float(variance.mean()), 0.0)) if len(variance) else None
+    def root(part: str) -> float | None:
+        own = [(e.residual_std**2 - e.noise_std**2)[e.parts[part]] for e in result.observations if part in e.parts]
+        return 1e3 * math.sqrt(max(float(np.concatenate(own).mean()), 0.0)) if own else None
 
-    return {"fit": root(fit), "held_out": root(rest)}
+    return {part: root(part) for part in PARTS}
 
 
 def _grid_change(result: RefineResult, fitted: ModelFit) -> float | None:
@@ -99,7 +100,7 @@ def _credible_set(first: Round | None) -> list[dict[str, Any]]:
     """Sets of effects of the first round, the most probable first."""
     if first is None or first.posterior is None:
         return []
-    sets = first.posterior.credible_set()
+    sets = first.posterior.credible_answers()
     return [{"effects": sorted(effects), "probability": p} for effects, p in sets.items()]
 
 
@@ -108,6 +109,10 @@ def _probability(first: Round, effect: str) -> float | None:
     if first.posterior is None:
         return None
     return first.posterior.sets().get(frozenset({*first.base.model.effects, effect}))
+
+
+def _test(found: Forecast) -> dict[str, float]:
+    return {"rmse_mm": found.found_mm, "expected_rmse_mm": found.expected_mm, "log_density": found.log_density}
 
 
 def _upper_limit(result: RefineResult, limit: UpperLimit) -> dict[str, Any]:
@@ -176,17 +181,15 @@ def _discrepancy(result: RefineResult) -> dict[str, Any] | None:
     term = result.forward_model.term(DISCREPANCY_FORCE)
     return {
         "effect": DISCREPANCY_FORCE, **_parameters(term, fitted),
-        "fit_rmse_mm": fitted.fit_mm, "held_out_rmse_mm": fitted.held_out_mm,
+        "fit_rmse_mm": fitted.fit_mm, "validation_rmse_mm": fitted.validation_mm, "test_rmse_mm": fitted.test_mm,
         "share": share(result), "peak": peak(sampled_fields(result)), "in_twin": result.force_in_twin,
     }  # fmt: skip
 
 
 def _errors(result: RefineResult, fitted: ModelFit) -> dict[str, Any]:
-    fit, rest = split_fields(fitted.fields, result.observations)
-    return {
-        "fit": {"trajectory_rmse_mm": rms_mm(fit)},
-        "held_out": {"trajectory_rmse_mm": rms_mm(rest)} if rest else {},
-    }
+    """[mm] over the instants of each part that there is."""
+    known = {part: part_mm(fitted.fields, result.observations, part) for part in PARTS}
+    return {part: {"trajectory_rmse_mm": value} for part, value in known.items() if value is not None}
 
 
 def _round(result: RefineResult, done: Round) -> dict[str, Any]:
@@ -207,7 +210,7 @@ def _refit(result: RefineResult, done: Round, trial: Trial) -> dict[str, Any]:
         "scope": scope_of(term),
         "explained": trial.candidate.explained,
         "fit_rmse_mm": fitted.fit_mm,
-        "held_out_rmse_mm": fitted.held_out_mm,
+        "validation_rmse_mm": fitted.validation_mm,
         "parameters": {
             _short(term, p.name): {"value": fitted.values[p.name], "stderr": fitted.stderr.get(p.name)}
             for p in term.parameters
@@ -221,16 +224,14 @@ def _refit(result: RefineResult, done: Round, trial: Trial) -> dict[str, Any]:
 
 
 def _observations(result: RefineResult) -> list[dict[str, Any]]:
-    """Errors [mm] of each observation, over its fitted and its held-out instants."""
+    """Errors [mm] of each observation, over the instants of each part."""
     rows = []
     for e, before, after in zip(result.observations, result.before.fields, result.after.fields, strict=True):
-        parts = {"fit": slice(0, e.fit_count), "held_out": slice(e.fit_count, None)}
-        seen = {name: part for name, part in parts.items() if len(before[part])}
         rows.append({
             "observation": e.name,
-            "instants": {name: len(before[part]) for name, part in seen.items()},
-            "before_mm": {name: rms_mm([before[part]]) for name, part in seen.items()},
-            "after_mm": {name: rms_mm([after[part]]) for name, part in seen.items()},
+            "instants": {name: len(before[part]) for name, part in e.parts.items()},
+            "before_mm": {name: rms_mm([before[part]]) for name, part in e.parts.items()},
+            "after_mm": {name: rms_mm([after[part]]) for name, part in e.parts.items()},
         })  # fmt: skip
     return rows
 
@@ -260,7 +261,7 @@ def _body(body: BodyResult) -> dict[str, Any]:
     return {
         "verdict": ADDED if body.effects else NOTHING,
         "effects": list(body.effects),
-        "held_out_mm": {"before": body.before_mm, "after": body.after_mm},
+        "validation_mm": {"before": body.before_mm, "after": body.after_mm},
         "objections": list(body.objections),
     }
 
@@ -270,7 +271,7 @@ def _shared(fit: SharedFit) -> dict[str, Any]:
     return {
         "effect": fit.term.effect, "bodies": list(fit.term.bodies), "parameter": _short(fit.term, p.name),
         "value": fit.fitted.values[p.name], "stderr": fit.fitted.stderr[p.name], "unit": fit.term.units[p.name],
-        "std_between_bodies": fit.strength_std, "held_out_rmse_mm": fit.fitted.held_out_mm,
+        "std_between_bodies": fit.strength_std, "validation_rmse_mm": fit.fitted.validation_mm,
         "log_bayes_factor": fit.log_bayes_factor,
     }  # fmt: skip
 
@@ -297,7 +298,8 @@ def _proposal(proposal: Proposal) -> dict[str, Any]:
 def arrays(result: RefineResult) -> dict[str, Any]:
     """refine.npz: ``observations``, their names; and of each, named ``key@observation``, ``times`` (T,) [s], ``points``
     (N, 3) [m] at the start, ``observed``, ``before`` and ``after`` (T, N, A) [m], the last two simulated less observed,
-    and ``fit_count``, how many instants were fitted. World frame, along the A axes that were measured.
+    ``fit_count``, how many instants were fitted, and ``test_count``, how many of the last ones no decision saw. World
+    frame, along the A axes that were measured.
 
     With a discrepancy force also ``force_places`` (T, S, 3) [m], where S of the points were (NaN if not seen), and
     ``force`` (T, S, 3) [m/s^2], the acceleration there; world frame."""
@@ -310,6 +312,7 @@ def arrays(result: RefineResult) -> dict[str, Any]:
             "before": e.field_in_world(before).astype(np.float32),
             "after": e.field_in_world(after).astype(np.float32),
             "fit_count": np.array(e.fit_count),
+            "test_count": np.array(e.test_count),
         }
         out |= {f"{key}@{e.name}": value for key, value in own.items()}
     for f in sampled_fields(result):
@@ -348,7 +351,7 @@ def text(document: Mapping[str, Any]) -> str:
     lines = [
         f"noise floor {shown['noise_floor_mm']:.1f} mm, a finer grid would change "
         f"{shown['discretization_mm']['fit'] or 0.0:.1f} mm; residual {shown['residual_mm']['fit']:.1f} mm fitted"
-        + _held(shown["residual_mm"]["held_out"])
+        + _validation(shown["residual_mm"]["validation"])
     ]
     for c in shown["candidates"][:6]:
         lines.append(
@@ -362,23 +365,26 @@ def text(document: Mapping[str, Any]) -> str:
     for a in shown["accepted"]:
         values = ", ".join(f"{n} {v:.4g}{_plus_minus(a['stderr'][n])} {a['unit'][n]}" for n, v in a["theta"].items())
         lines.append(f"{a['effect']}: {values}" + _looks_like(a["indistinguishable_from"]))
-    lines.append(
-        f"before {before['fit']['trajectory_rmse_mm']:.1f} mm{_held(before['held_out'].get('trajectory_rmse_mm'))}, "
-        f"after {after['fit']['trajectory_rmse_mm']:.1f} mm{_held(after['held_out'].get('trajectory_rmse_mm'))}"
-    )
+    lines.append(f"before {_parts_mm(before)}; after {_parts_mm(after)}")
     force = shown["discrepancy_force"]
     if force is not None:
         lines.append(
             f"a smooth force without a known cause would leave {force['fit_rmse_mm']:.1f} mm"
-            f"{_held(force['held_out_rmse_mm'])}: it stands in for the discrepancy and explains nothing"
+            f"{_validation(force['validation_rmse_mm'])}: it stands in for the discrepancy and explains nothing"
         )
         lines += _force_lines(force)
     lines += _several_bodies(shown["bodies"], shown["shared"])
     if shown["verdict"] != RANKED:
         lines.append(
-            f"probability of no effect {shown['null_probability']:.2g}; a residual as large as that after has a "
-            f"probability of {shown['predictive_p']['after']:.2g} if nothing is missing"
+            f"probability of no effect {shown['null_probability']:.2g}, of something unknown "
+            f"{shown['unknown_probability']:.2g}; a residual as large as that after has a probability of "
+            f"{shown['predictive_p']['after']:.2g} if nothing is missing"
         )
+        lines += [
+            f"test, {name}: {x['rmse_mm']:.1f} mm, expected {x['expected_rmse_mm']:.1f} mm, log density "
+            f"{x['log_density']:.1f}"
+            for name, x in shown["test"].items()
+        ]
     lines += _limit_lines(shown["upper_limits"])
     n = shown["next_experiment"]
     if n is not None:
@@ -397,7 +403,7 @@ def _force_lines(force: Mapping[str, Any]) -> list[str]:
         return []
     way = ", ".join(f"{v:.2f}" for v in peak["direction"])
     place = ", ".join(f"{v:.2f}" for v in peak["place"]["value"])
-    shares = [f"{100 * s:.0f} % {what}" for what, s in zip(("fitted", "held out"), force["share"].values(), strict=True)
+    shares = [f"{100 * s:.0f} % ({what})" for what, s in force["share"].items()
               if s is not None]  # fmt: skip
     return [
         f"  it is strongest at {peak['time']['value']:.2f} s at ({place}) m: {peak['acceleration']['value']:.2g} m/s^2 "
@@ -406,7 +412,7 @@ def _force_lines(force: Mapping[str, Any]) -> list[str]:
 
 
 def _refit_line(row: Mapping[str, Any]) -> str:
-    errors = f"{row['fit_rmse_mm']:.1f} mm{_held(row['held_out_rmse_mm'])}"
+    errors = f"{row['fit_rmse_mm']:.1f} mm{_validation(row['validation_rmse_mm'])}"
     return f"  refit {row['effect']} ({row['law']}): {errors}: {outcome(row)}"
 
 
@@ -426,9 +432,9 @@ def _probable(probability: float | None) -> str:
 def _several_bodies(bodies: Mapping[str, Any], shared: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = []
     for name, row in bodies.items():
-        held = row["held_out_mm"]
+        held = row["validation_mm"]
         what = ", ".join(row["effects"]) or row["verdict"]
-        lines.append(f"  {name:24s} {what:28s} held out {held['before']:.0f} -> {held['after']:.0f} mm")
+        lines.append(f"  {name:24s} {what:28s} validation {held['before']:.0f} -> {held['after']:.0f} mm")
     for row in shared:
         lines.append(
             f"one {row['parameter'].replace('_', ' ')} for {', '.join(row['bodies'])}: {row['value']:.3g} ± "
@@ -441,8 +447,14 @@ def _looks_like(others: Sequence[str]) -> str:
     return f"  (looks like {', '.join(others)})" if others else ""
 
 
-def _held(value: float | None) -> str:
-    return "" if value is None else f", {value:.1f} mm held out"
+def _validation(value: float | None) -> str:
+    return "" if value is None else f", {value:.1f} mm validation"
+
+
+def _parts_mm(errors: Mapping[str, Any]) -> str:
+    words = {"fit": "fitted"}
+    known = [(words.get(part, part), errors[part]["trajectory_rmse_mm"]) for part in PARTS if part in errors]
+    return ", ".join(f"{value:.1f} mm {word}" for word, value in known)
 
 
 def _vector(quantity: Mapping[str, Any]) -> str:

@@ -34,6 +34,7 @@ NOT_FOR_TRACKS = {
     "families": "the law of identify",
     "laws": "identify.law",
     "baseline_rollouts": "tracks.rollouts",
+    "test_fraction": "the runs with `use: test`",
     "tracking_error": "the noise of the markers at rest",
 }
 """Keys of refine that say nothing of tracks, and what holds for these."""
@@ -43,7 +44,8 @@ def refine_tracks(
     tracks: Tracks, twin: Twin, refine_config: RefineConfig, config: TracksConfig, simulator: SimulatorConfig, *,
     condition: str | None = None, dry_run: bool = False, folder: Path | None = None, progress: Progress = silent,
 ) -> RefineResult:  # fmt: skip
-    """Which effects does the model of the runs lack? Runs with ``use: hold_out`` judge them.
+    """Which effects does the model of the runs lack? Runs with ``use: hold_out`` judge them; errors of runs
+    with ``use: test`` are reported.
 
     Of one body, the runs of ``condition`` (None: the first): in the first condition the law is fitted with the effects;
     in others it and the effects already known are as ``twin`` says. ``twin``: as identify made it, with the effects of
@@ -77,7 +79,7 @@ def refine_group(tracks: Tracks, group: str, settings: SearchSettings) -> Refine
     out."""
     forward_model = PointMassModel(tracks, flight_observations(tracks, group))
     for body in forward_model.bodies:
-        if {run.fitted for run in forward_model.observations if run.body == body} != {True, False}:
+        if not {"fit", "hold_out"} <= {run.purpose for run in forward_model.observations if run.body == body}:
             raise InputError(f"{tracks.path}: body {body} needs a run to fit and one with `use: hold_out` to judge by")
     return refine_bodies(forward_model, settings)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,9 @@ from masiv.inference.marginal_likelihood import Marginal
 from masiv.inference.model_fit import ModelFit
 from masiv.models.base import ForwardModel
 
+GRAVITY_EFFECT = "gravity_scale"
+UNKNOWN = "something unknown"
+"""Stands among effects for what no effect of the library is."""
 CREDIBLE = 0.95
 """Probability of the smallest set of answers that is reported."""
 
@@ -41,15 +44,23 @@ class Hypothesis:
         errors = {
             p.name: float(s) * (abs(self.fitted.values[p.name]) if p.log else 1.0)
             for p, s in zip(self.linear.parameters, spread, strict=True)
+            if p.name in self.fitted.values
         }
         return replace(self.fitted, stderr={**self.fitted.stderr, **errors})
 
 
 def linearized(forward_model: ForwardModel, fitted: ModelFit) -> LinearModel:
-    """``fitted`` with derivatives by all parameters of its model, places that were held at a guess included. Raises
-    NonFiniteError."""
-    parameters = [p for p in forward_model.parameters(fitted.model) if p.name in fitted.values]
-    return linear_model(forward_model, fitted.model, fitted.values, parameters)
+    """``fitted`` with derivatives by all parameters of its model, places that were held at a guess included; and by
+    gravity, which is known to a part, if the model can have another one. Raises NonFiniteError."""
+    model = fitted.model
+    parameters = [p for p in forward_model.parameters(model) if p.name in fitted.values]
+    line = linear_model(forward_model, model, fitted.values, parameters)
+    if GRAVITY_EFFECT not in forward_model.candidates(model):
+        return line
+    term = forward_model.term(GRAVITY_EFFECT)
+    values = {**fitted.values, **{p.name: 0.0 for p in term.strengths}}
+    gravity = linear_model(forward_model, model.with_effect(term.name), values, term.strengths)
+    return line.with_parameters(model, fitted.values, gravity)
 
 
 def weighed(forward_model: ForwardModel, fits: Sequence[ModelFit], linear: Sequence[LinearModel]) -> list[Hypothesis]:
@@ -89,8 +100,12 @@ class Posterior:
         """Probability that no more than ``count`` effects act."""
         return sum(p for h, p in zip(self.hypotheses, self.probabilities, strict=True) if len(h.effects) <= count)
 
+    def unknown(self) -> float:
+        """Probability that something unknown acts, with or without effects."""
+        return sum(p * h.marginal.unknown for h, p in zip(self.hypotheses, self.probabilities, strict=True))
+
     def sets(self) -> dict[frozenset[str], float]:
-        """Probability of each set of effects, over the laws; most probable first."""
+        """Probability of each set of effects, over the laws and whether something unknown acts; most probable first."""
         out: dict[frozenset[str], float] = {}
         for h, p in zip(self.hypotheses, self.probabilities, strict=True):
             out[h.effects] = out.get(h.effects, 0.0) + p
@@ -109,13 +124,26 @@ class Posterior:
         return max(own, key=lambda h: h.marginal.log_evidence)
 
     def credible_set(self) -> dict[frozenset[str], float]:
-        """The fewest sets of effects that have a probability of ``CREDIBLE`` together."""
-        out: dict[frozenset[str], float] = {}
-        for effects, p in self.sets().items():
-            out[effects] = p
-            if sum(out.values()) >= CREDIBLE:
-                break
-        return out
+        """The fewest sets of effects that have a probability of ``CREDIBLE`` together, over whether something unknown
+        acts as well."""
+        return _most_probable(self.sets())
+
+    def credible_answers(self) -> dict[frozenset[str], float]:
+        """The same with ``UNKNOWN`` among the effects."""
+        parts: dict[frozenset[str], float] = {}
+        for h, p in zip(self.hypotheses, self.probabilities, strict=True):
+            for effects, share in ((h.effects, 1 - h.marginal.unknown), (h.effects | {UNKNOWN}, h.marginal.unknown)):
+                parts[effects] = parts.get(effects, 0.0) + p * share
+        return _most_probable(parts)
+
+
+def _most_probable(sets: Mapping[frozenset[str], float]) -> dict[frozenset[str], float]:
+    out: dict[frozenset[str], float] = {}
+    for effects, p in sorted(sets.items(), key=lambda item: -item[1]):
+        out[effects] = p
+        if sum(out.values()) >= CREDIBLE:
+            break
+    return out
 
 
 def log_prior(effects: int, candidates: int) -> float:

@@ -55,7 +55,13 @@ def upper_limit(
     """The limit of ``term`` in addition to the model ``at``, which has the effects ``terms`` and ``log_evidence``."""
     values, columns = found
     joined = at.with_parameters(columns.model, values, columns)
-    kept = [k for k, p in enumerate(joined.parameters) if p.name not in term.replaces_parameter]
+    own = {p.name for p in columns.parameters}  # gravity is known to a part without being an effect
+    gone = {p.name for p in at.parameters} & own
+    kept = [
+        k
+        for k, p in enumerate(joined.parameters)
+        if p.name not in term.replaces_parameter and (k >= len(at.parameters) or p.name not in gone)
+    ]
     joined = replace(
         joined,
         parameters=tuple(joined.parameters[k] for k in kept),

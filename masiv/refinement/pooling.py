@@ -112,7 +112,7 @@ class _Pool:
         """Effects and held-out errors of each body."""
         model, before, after = self.forward_model, self.search.before, self.search.after
         terms = [model.term(n) for n in after.model.effects]
-        was, now = (model.by_body(f.model, f.values, fitted=False) for f in (before, after))
+        was, now = (model.by_body(f.model, f.values, "hold_out") for f in (before, after))
         out = {}
         for body in model.bodies:
             effects = tuple(t.effect for t in terms if not t.bodies or body in t.bodies)

@@ -74,6 +74,7 @@ def prepare(
         points=body.particles.double().numpy(),
         values=body.targets.numpy(),
         fit_count=(len(fitted.times) - 1) * samples,
+        test_count=math.floor(config.test_fraction * (len(whole.times) - len(fitted.times))) * samples,
         noise_std=noise,
         residual_std=np.hypot(noise, np.maximum.accumulate(lost)),
         samples_per_frame=samples,

@@ -102,8 +102,8 @@ class RefineResult:
     @property
     def verdict(self) -> str:
         """ "unexplained residual" if so large a residual is improbable with nothing missing, whether an effect was
-        added or not; else "effect added"; "nothing missing" if that is more probable than not, and an effect would more
-        probably than not have been seen; else "cannot tell"; "ranked only" if none was fitted."""
+        added or not; else "effect added"; "nothing missing" if no effect and nothing unknown is more probable than not,
+        and most effects would have been seen; else "cannot tell"; "ranked only" if none was fitted."""
         if self.ranked_only:
             return RANKED
         if self.predictive_p["after"] < self.config.min_predictive_p:
@@ -112,21 +112,22 @@ class RefineResult:
             return ADDED
         visible = sum(limit.determined for limit in self.search.limits)
         seen = 2 * visible >= len(self.search.limits)
-        return NOTHING if seen and self.search.null_probability > 0.5 else CANNOT_TELL
+        nothing = self.search.null_probability > 0.5 and self.search.unknown_probability < 0.5
+        return NOTHING if seen and nothing else CANNOT_TELL
 
     @property
     def predictive_p(self) -> Mapping[str, float]:
-        """See ``SearchResult``; ``before`` and ``after``."""
-        return self.search.predictive_p or {"before": 1.0, "after": 1.0}
+        """See ``Check``; ``before`` and ``after``."""
+        return {name: check.p for name, check in self.search.checks.items()} or {"before": 1.0, "after": 1.0}
 
     @property
     def force_in_twin(self) -> bool:
-        """Whether there is a force for the discrepancy that does not make the held-out motion worse."""
+        """Whether there is a force for the discrepancy that does not make the motion for validation worse."""
         force = self.search.discrepancy
         if force is None:
             return False
-        held, before = force.held_out_mm, self.after.held_out_mm
-        return held is None or before is None or held <= before
+        found, before = force.validation_mm, self.after.validation_mm
+        return found is None or before is None or found <= before
 
     @property
     def changes_twin(self) -> bool:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from masiv.inference.model_fit import ModelFit, rank_by_bic
+from masiv.inference.predictive import Forecast
 from masiv.models.base import ForwardModel
 from masiv.refinement.candidates import Candidate, Ranking
 from masiv.refinement.hypotheses import Posterior
@@ -62,19 +63,30 @@ class Round:
 
 
 @dataclass(frozen=True)
+class Check:
+    """p: probability of a residual as large as that of a model, see ``predictive_p``. test: what the model says of the
+    instants of the test, None if there are none."""
+
+    p: float
+    test: Forecast | None = None
+
+
+@dataclass(frozen=True)
 class SearchResult:
     """forward_model: with the observations, as whitened at the end, that all fits are compared with. before: the best
     model without effects. after: with what was accepted, ``before`` itself if nothing was. null_probability: that no
-    effect acts. predictive_p: of a residual as large as that of ``after``, see ``predictive_p``. limits: of effects
-    that were not accepted. discrepancy: ``after`` with a smooth force for what is still unexplained, None if there is
-    no need or no use. whitened_before: with the observations as whitened for ``before``; None: as ``forward_model``."""
+    effect of the library acts; unknown_probability: that something else does, with or without ``after``'s effects.
+    checks: of ``before`` and ``after``; empty if effects were only ranked. limits: of effects that were not accepted.
+    discrepancy: ``after`` with a smooth force for what is still unexplained, None if there is no need or no use.
+    whitened_before: with the observations as whitened for ``before``; None: as ``forward_model``."""
 
     forward_model: ForwardModel
     before: ModelFit
     after: ModelFit
     rounds: tuple[Round, ...]
     null_probability: float = 1.0
-    predictive_p: dict[str, float] | None = None
+    unknown_probability: float = 0.0
+    checks: Mapping[str, Check] = field(default_factory=dict)
     limits: tuple[UpperLimit, ...] = ()
     discrepancy: ModelFit | None = None
     whitened_before: ForwardModel | None = None

@@ -8,15 +8,16 @@ from dataclasses import replace
 
 from masiv.errors import MasivError
 from masiv.inference.discretization import with_residual_std
-from masiv.inference.evidence import Evidence, predictive_p
+from masiv.inference.evidence import Evidence
 from masiv.inference.model_fit import ModelFit, rank_by_bic, refit_whitened, warm_started_fit
+from masiv.inference.predictive import forecast, predictive_p
 from masiv.inference.robust import robust_scale_of
 from masiv.models.base import ForwardModel
 from masiv.refinement.discrepancy import discrepancy_force
 from masiv.refinement.effect_fit import BROYDEN_STEPS
 from masiv.refinement.hypotheses import linearized, log_prior
 from masiv.refinement.limits import UpperLimit, sensitivity, upper_limit
-from masiv.refinement.rounds import Round, SearchResult
+from masiv.refinement.rounds import Check, Round, SearchResult
 from masiv.refinement.search_round import run_round
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks
@@ -43,15 +44,17 @@ def search_effects(
         return SearchResult(state.forward_model, before, before, tuple(rounds), whitened_before=start.forward_model)
     null = rounds[0].posterior.with_at_most(0) if rounds and rounds[0].posterior else 1.0
     after = state.fit if state.fit.model.effects else before
-    checked = {"before": _predictive_p(start, before), "after": _predictive_p(state, after)}
+    checked = {"before": _check(start, before)}
+    checked["after"] = checked["before"] if after is before else _check(state, after)
     discrepancy = None
-    if settings.discrepancy_force and checked["after"] < settings.config.min_predictive_p:
+    if settings.discrepancy_force and checked["after"].p < settings.config.min_predictive_p:
         discrepancy = discrepancy_force(state.with_fit(after), settings)
     limits = _upper_limits(state.with_fit(after), rounds, settings)
     if after is before:
         null = _with_unfitted(null, rounds, limits)
+    unknown = rounds[-1].posterior.unknown() if rounds and rounds[-1].posterior else 0.0
     return SearchResult(
-        state.forward_model, before, after, tuple(rounds), null, checked, tuple(limits), discrepancy,
+        state.forward_model, before, after, tuple(rounds), null, unknown, checked, tuple(limits), discrepancy,
         whitened_before=start.forward_model,
     )  # fmt: skip
 
@@ -140,10 +143,12 @@ def _rivals(state: SearchState, done: Round) -> list[ModelFit]:
     return out[:RIVALS]
 
 
-def _predictive_p(state: SearchState, fitted: ModelFit) -> float:
+def _check(state: SearchState, fitted: ModelFit) -> Check:
     line = linearized(state.forward_model, fitted)
     terms = [state.forward_model.term(n) for n in fitted.model.effects]
-    return predictive_p(Evidence.of(state.forward_model.observations, line.fields), line, terms)
+    evidence = Evidence.of(state.forward_model.observations, line.fields)
+    found = forecast(evidence, line, terms, evidence.marginal(line, terms))
+    return Check(predictive_p(evidence, line, terms), found)
 
 
 def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchSettings) -> list[UpperLimit]:

@@ -122,14 +122,19 @@ def material_curves(curves: Mapping[str, Mapping[str, Any]]) -> bytes:
     return _png(figure)
 
 
-def residual_in_time(curves: Mapping[str, np.ndarray], times: np.ndarray, fitted: int, noise_mm: float) -> bytes:
-    """Residuals. curves: name -> (K, N, 3) [m] at ``times`` (K,) [s], of which the first ``fitted`` were fitted."""
+def residual_in_time(
+    curves: Mapping[str, np.ndarray], times: np.ndarray, fitted: int, test: int, noise_mm: float
+) -> bytes:
+    """Residuals. curves: name -> (K, N, 3) [m] at ``times`` (K,) [s], of which the first ``fitted`` were fitted and the
+    last ``test`` are for the test."""
     figure, (axis,) = _figure(1, size=(7.2, 3.4))
     half = (times[1] - times[0]) / 2 if len(times) > 1 else times[0] / 2
-    edge = times[min(fitted, len(times)) - 1] + half
-    axis.axvspan(times[0] - half, edge, color=BLUE, alpha=0.07, linewidth=0, label="fitted")
-    if fitted < len(times):
-        axis.axvspan(edge, times[-1] + half, color=ORANGE, alpha=0.12, linewidth=0, label="held out")
+    edges = [0, fitted, len(times) - test, len(times)]
+    parts = (("fitted", BLUE, 0.07), ("validation", ORANGE, 0.12), ("test", GREY, 0.2))
+    for first, last, (label, colour, alpha) in zip(edges[:-1], edges[1:], parts, strict=True):
+        if first < last:
+            begin, end = times[first] - half, times[last - 1] + half
+            axis.axvspan(begin, end, color=colour, alpha=alpha, linewidth=0, label=label)
     axis.axhline(noise_mm, color=GREY, linestyle="--", linewidth=1.2, label="noise floor")
     for colour, (name, field) in zip((ORANGE, BLUE), curves.items(), strict=False):
         rms = 1e3 * np.sqrt((field.astype(np.float64) ** 2).sum(2).mean(1))

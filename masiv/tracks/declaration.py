@@ -127,7 +127,8 @@ class RunDeclaration(_Part):
 
     ``file``: CSV or C3D, relative to the scene. ``select``: only the rows whose columns have these values. ``markers``:
     only these. ``time`` [s]: first and last time that is used.
-    ``use``: `fit` for training, `hold_out` for evaluation only. ``condition``: runs with the same name have the same
+    ``use``: `fit` for training; `hold_out` for validation, which takes part in the choice of effects; `test` for runs
+    that nothing sees before their errors are reported. ``condition``: runs with the same name have the same
     treatment of the body, for example a load or a wind.
     ``rest_frames`` [first, last): frames in which the body is held at rest. ``release_time`` [s, as in the file]: by
     default it is estimated. ``ignore_after_release`` [s]: the run is not compared with the model for this
@@ -138,7 +139,7 @@ class RunDeclaration(_Part):
     file: Path
     name: str | None = None
     body: str | None = None
-    use: Literal["fit", "hold_out"] = "fit"
+    use: Literal["fit", "hold_out", "test"] = "fit"
     condition: str = ""
     select: dict[str, str | int | float] = {}
     markers: tuple[str, ...] | None = None

@@ -54,11 +54,12 @@ class TrackedBody:
 class Run:
     """One recording of one body. World axes, metres, seconds.
 
-    positions (T, M, 3), NaN where nothing was measured; times (T,) as in the file, increasing; rate [Hz]; purpose: fit
-    or hold_out; rest: frames at rest before the release; at_rest (M, 3): where markers are then (in the first frame
-    that shows them, without rest frames), NaN for what was not measured; noise_std (M, 3): standard deviation of each
-    axis at rest (None: without two rest frames); release [s]: when the body is let go (None: not known); placement: the
-    body's own axes -> world at rest (None: no geometry); ignore_after_release [s]: not compared for this long.
+    positions (T, M, 3), NaN where nothing was measured; times (T,) as in the file, increasing; rate [Hz]; purpose: fit,
+    hold_out or test; rest: frames at rest before the release; at_rest (M, 3): where markers are then (in the first
+    frame that shows them, without rest frames), NaN for what was not measured; noise_std (M, 3): standard deviation of
+    each axis at rest (None: without two rest frames); release [s]: when the body is let go (None: not known);
+    placement: the body's own axes -> world at rest (None: no geometry); ignore_after_release [s]: not
+    compared for this long.
     """
 
     name: str
@@ -155,7 +156,7 @@ class Tracks:
     layout = "tracks"
 
     def chosen(self, purpose: str, *, body: str | None = None, condition: str | None = None) -> tuple[Run, ...]:
-        """Runs by purpose (fit, hold_out) and, where given, by body and condition."""
+        """Runs by purpose (fit, hold_out, test) and, where given, by body and condition."""
         return tuple(
             run
             for run in self.runs

@@ -337,7 +337,7 @@ def refined(found: dict[str, Any]) -> Numbers:
                         "law": t["law"],
                         "effect": t["effect"],
                         "scope": t.get("scope", "all"),
-                        "rmse_mm": [t["fit_rmse_mm"], t["held_out_rmse_mm"]],
+                        "rmse_mm": [t["fit_rmse_mm"], t["validation_rmse_mm"]],
                         "log_bayes_factor": t["log_bayes_factor"],
                         "accepted": t["accepted"],
                         "impossible": len(t["impossible"]),
@@ -357,7 +357,7 @@ def refined(found: dict[str, Any]) -> Numbers:
             }
             for a in found["accepted"]
         ],
-        "smooth_force_mm": force and [force["fit_rmse_mm"], force["held_out_rmse_mm"]],
+        "smooth_force_mm": force and [force["fit_rmse_mm"], force["validation_rmse_mm"]],
         **{
             when: {
                 span: {own: found[when][span][key] for own, key in errors.items() if key in found[when][span]}
@@ -379,11 +379,11 @@ def refined(found: dict[str, Any]) -> Numbers:
             if of_tracks
         },
         "bodies": {
-            name: [b["verdict"], b["effects"], b["held_out_mm"]["before"], b["held_out_mm"]["after"]]
+            name: [b["verdict"], b["effects"], b["validation_mm"]["before"], b["validation_mm"]["after"]]
             for name, b in found.get("bodies", {}).items()
         },
         "shared": [
-            [s["effect"], s["bodies"], s["value"], s["stderr"], s["std_between_bodies"], s["held_out_rmse_mm"]]
+            [s["effect"], s["bodies"], s["value"], s["stderr"], s["std_between_bodies"], s["validation_rmse_mm"]]
             for s in found.get("shared", [])
         ],
     }

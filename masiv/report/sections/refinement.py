@@ -16,6 +16,8 @@ from masiv.report import plots
 from masiv.report.page import Page, Share, number
 
 REFINED, FIELDS = "refine.json", "refine.npz"
+PARTS = {"fit": "fitted", "validation": "validation", "test": "test"}
+"""Of the instants, in words."""
 METRICS = {
     "trajectory_rmse_mm": ("distance to the observed motion, RMS", "mm"),
     "chamfer_1e3mm2": ("chamfer distance to the observed motion", "10³ mm²"),
@@ -34,10 +36,11 @@ def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | No
         document = json.loads((run / REFINED).read_text(encoding="utf-8"))
         with np.load(run / FIELDS, allow_pickle=False) as file:
             first = str(file["observations"][0])
-            fields = {name: file[f"{name}@{first}"] for name in ("before", "after", "points", "times", "fit_count")}
+            names = ("before", "after", "points", "times", "fit_count", "test_count")
+            fields = {name: file[f"{name}@{first}"] for name in names}
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise InputError(f"{run / REFINED} and {FIELDS} cannot be read ({error}): run masiv refine again") from error
-    if not isinstance(document, dict) or document.get("schema") != 3:
+    if not isinstance(document, dict) or document.get("schema") != 4:
         raise InputError(f"{run / REFINED} is of another version of masiv: run masiv refine again")
     return document, fields
 
@@ -68,11 +71,11 @@ def refinement_section(
 def _bodies(page: Page, bodies: Mapping[str, Any]) -> None:
     if not bodies:
         return
-    page.subheading("By body, on held-out observations")
+    page.subheading("By body, on observations for validation")
     page.table(
         ["body", "verdict", "effects", "before [mm]", "after [mm]"],
         [
-            [name, b["verdict"], ", ".join(b["effects"]), b["held_out_mm"]["before"], b["held_out_mm"]["after"]]
+            [name, b["verdict"], ", ".join(b["effects"]), b["validation_mm"]["before"], b["validation_mm"]["after"]]
             for name, b in bodies.items()
         ],
     )
@@ -85,7 +88,7 @@ def _verdict(document: Mapping[str, Any]) -> str:
         law += f", then {words(laws['after'])}"
     errors = [
         f"{label} {_mm(document['before'], split)} → {_mm(document['after'], split)} mm"
-        for split, label in (("fit", "fitted"), ("held_out", "held out"))
+        for split, label in PARTS.items()
         if document["before"].get(split)
     ]
     return (
@@ -97,9 +100,12 @@ def _verdict(document: Mapping[str, Any]) -> str:
 
 
 def _probabilities(document: Mapping[str, Any]) -> str:
-    p, check = document["null_probability"], document["predictive_p"]["after"]
+    p, unknown = document["null_probability"], document["unknown_probability"]
+    check, test = document["predictive_p"]["after"], document["test"].get("after")
+    expected = "" if test is None else f"The final model expects {number(test['expected_rmse_mm'])} mm on the test. "
     return (
-        f"Probability that no effect acts: {number(p)}; of so large a residual with nothing missing: {number(check)}. "
+        f"Probability that no effect acts: {number(p)}; that something unknown acts: {number(unknown)}; of so large a "
+        f"residual with nothing missing: {number(check)}. {expected}"
     )
 
 
@@ -121,11 +127,15 @@ def _figures(page: Page, document: Mapping[str, Any], fields: Mapping[str, np.nd
     shown = {name if added else "without effects": fields[name] for name in names}
     times = fields["times"]
     page.picture(
-        plots.residual_in_time(shown, times, int(fields["fit_count"]), document["noise_floor_mm"]), "residual in time"
+        plots.residual_in_time(
+            shown, times, int(fields["fit_count"]), int(fields["test_count"]), document["noise_floor_mm"]
+        ),
+        "residual in time",
     )
     page.note(
-        "The gap between the curves is what the added effect explains. No fit saw the held-out frames, which take part "
-        "in the choice of effects. What stays above the dashed line is not noise."
+        "The gap between the curves is what the added effect explains. Frames for validation are not fitted and take "
+        "part in the choice of effects; nothing has seen those of the test. What stays above the dashed line is no "
+        "noise."
         if added
         else "A curve near the dashed line leaves nothing to explain; one that grows away from it is missing physics."
     )
@@ -192,7 +202,7 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
             values = ", ".join(f"{words(n)} {number(_number(q['value']))}" for n, q in refit["parameters"].items())
             rows.append([
                 turn, ", ".join(map(words, [*done["base"]["effects"], _name(refit)])), words(refit["law"]),
-                _number(refit["fit_rmse_mm"]), _number(refit["held_out_rmse_mm"]),
+                _number(refit["fit_rmse_mm"]), _number(refit["validation_rmse_mm"]),
                 _number(refit["log_bayes_factor"]), values, outcome(refit),
             ])  # fmt: skip
     if not rows:
@@ -204,7 +214,7 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
             "effects",
             "law",
             "fitted [mm]",
-            "held out [mm]",
+            "validation [mm]",
             "log Bayes factor",
             "values",
             "outcome",
@@ -216,16 +226,15 @@ def _refits(page: Page, rounds: Sequence[Mapping[str, Any]]) -> None:
 
 def _before_after(page: Page, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
     page.subheading("Before and after")
-    splits = [split for split in ("fit", "held_out") if before.get(split)]
+    splits = [split for split in PARTS if before.get(split)]
     keys = [*METRICS, *sorted({k for s in splits for k in before[s]} - METRICS.keys() - {"frames"})]
     rows = []
     for key in keys:
         cells = [_number(errors[split].get(key)) for split in splits for errors in (before, after)]
         if any(cell is not None for cell in cells):
             rows.append([*METRICS.get(key, (words(key), "")), *cells])
-    labels = {"fit": "fitted", "held_out": "held out"}
-    page.table(["quantity", "unit", *(f"{labels[s]}, {when}" for s in splits for when in ("before", "after"))], rows)
-    frames = [f"{labels[s]}: {_span(before[s]['frames'])}" for s in splits if before[s].get("frames")]
+    page.table(["quantity", "unit", *(f"{PARTS[s]}, {when}" for s in splits for when in ("before", "after"))], rows)
+    frames = [f"{PARTS[s]}: {_span(before[s]['frames'])}" for s in splits if before[s].get("frames")]
     if frames:
         page.note(f"Frames {'; '.join(frames)}. Before: the best model without effects, not the learnt law.")
 
@@ -271,8 +280,8 @@ def _unexplained(page: Page, left: Mapping[str, Any], force: Mapping[str, Any] |
     )
     if force is not None:
         errors = f"{number(_number(force['fit_rmse_mm']))} mm"
-        if force["held_out_rmse_mm"] is not None:
-            errors += f", {number(_number(force['held_out_rmse_mm']))} mm held out"
+        if force["validation_rmse_mm"] is not None:
+            errors += f", {number(_number(force['validation_rmse_mm']))} mm validation"
         page.note(
             "A force that changes smoothly in time and space and stands in for the discrepancy, without a known cause, "
             f"leaves {errors}. The twin has it as smooth force, to be used meanwhile; it holds for this motion alone."

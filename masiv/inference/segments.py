@@ -1,0 +1,165 @@
+"""Instants of an observation in modes of motion, and what errors are expected of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from masiv.inference.error_covariance import ErrorBlock
+from masiv.inference.motion_modes import MotionModes, rotations_since_start
+from masiv.inference.noise_model import OBSERVATION_LIMITED_RATIO
+from masiv.observations.base import Observation
+
+MIN_TURNED_POINTS = 4
+"""Fewer points do not tell how a body has turned."""
+GRID_CORRELATION = 1 / 3
+"""Correlation time of what another grid changes, over the length of the record."""
+MIN_SEGMENT = 2
+"""Instants of a segment that take part in decisions, at the least."""
+MIN_SERIES = 0.1
+"""Independent series of a group that moves with others, at the least."""
+MAX_INSTANTS = 256
+"""A longer record is thinned to as many."""
+DIFFERENCES, DIFFERENCE_VARIANCE = 3, 20.0
+"""Third differences leave little of a smooth motion; those of independent values have 20 times their variance."""
+CHI2_MEDIAN = 0.4549
+"""Median of the square of a standard normal variable."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Instants of an observation in modes of motion: those that are observation-limited, or those from the first on
+    that is not, in which errors of the simulation move all modes together.
+
+    kept: instants (T,), of which the first ``decided`` take part in decisions and the rest is for the test; what is
+    expected is found from the former alone. turned: see ``MotionModes.coefficients``. jitter (G,) [m]: expected jitter
+    of a coefficient; smooth (T,) [m]: expected smooth error of a point along an axis; grid: of each group, (T,) [m] by
+    which another grid may change a coefficient; weights (G,): powers of the likelihood of each group; first_group:
+    number of groups of other kinds of segments.
+    """
+
+    index: int
+    observation: Observation
+    modes: MotionModes
+    kept: np.ndarray
+    decided: int
+    turned: np.ndarray | None
+    jitter: tuple[float, ...]
+    smooth: np.ndarray
+    grid: tuple[np.ndarray, ...]
+    weights: tuple[float, ...]
+    first_group: int
+
+    @classmethod
+    def of(cls, index: int, observation: Observation, field: np.ndarray) -> list[Segment]:
+        """Of observation number ``index``. field (T, N, A) [m]: the residual of the best model."""
+        count, axes = field.shape[1:]
+        modes = MotionModes.of(observation.points, axes)
+        stride = math.ceil(len(field) / MAX_INSTANTS)
+        seen = np.isfinite(observation.values).any(axis=(1, 2))
+        kept = np.flatnonzero(seen)[::stride]
+        decided = int((kept < observation.decided_count).sum())
+        if decided < MIN_SEGMENT:
+            return []
+        turned = None
+        if axes == 3 and count >= MIN_TURNED_POINTS:
+            positions = np.where(np.isfinite(observation.values), observation.values, observation.points)
+            turned = rotations_since_start(observation.points, positions[kept].astype(np.float64))
+        grid = _grid_changes(observation, modes, kept, turned)
+        known = observation.observation_std[kept] / math.sqrt(axes)
+        floor = float(known.min()) / math.sqrt(count)
+        known_turn = None if turned is None else turned[:decided]
+        jitter = tuple(jitter_of(c) or floor for c in modes.coefficients(field[kept[:decided]], known_turn))
+        smooth = np.full(len(kept), jitter[0]) if count == 1 else known
+        limited = observation.residual_std[kept] < OBSERVATION_LIMITED_RATIO * observation.noise_std
+        split = len(kept) if limited.all() or not observation.grid_corrections else int(np.argmin(limited))
+        out = []
+        for late, part in ((False, slice(0, split)), (True, slice(split, None))):
+            count = len(kept[:decided][part])
+            if count < MIN_SEGMENT:
+                continue
+            own = None if turned is None else turned[part]
+            parts = modes.coefficients(field[kept[part][:count]], None if own is None else own[:count])
+            out.append(
+                cls(
+                    index, observation, modes, kept[part], count, own, jitter, smooth[part],
+                    tuple(g[part] for g in grid), _weights(parts, together=late), len(modes.names) if late else 0,
+                )
+            )  # fmt: skip
+        return out
+
+    def blocks(self, field: np.ndarray, jacobian: np.ndarray, *, test: bool = False) -> list[ErrorBlock]:
+        """Of a residual field (T, N, A) [m] and its derivatives (T, N, A, P); with the instants of the test if asked
+        for."""
+        part = slice(None, None if test else self.decided)
+        kept, turned = self.kept[part], None if self.turned is None else self.turned[part]
+        times = self.observation.times[kept]
+        lags = np.abs(np.subtract.outer(times, times))
+        residuals = self.modes.coefficients(field[kept], turned)
+        jacobians = self.modes.coefficients(jacobian[kept], turned)
+        groups = len(self.modes.names)
+        motion = max(self.observation.extent / float(np.median(self.smooth)), 1.0)
+        return [
+            ErrorBlock(
+                residual, derivatives, lags, self.first_group + group, self.jitter[group],
+                self.smooth[part] * math.sqrt(self.modes.axes / (residual.shape[1] * groups)), self.grid[group][part],
+                GRID_CORRELATION * float(self.observation.times[-1]), self.weights[group], motion,
+            )
+            for group, (residual, derivatives) in enumerate(zip(residuals, jacobians, strict=True))
+        ]  # fmt: skip
+
+
+def _weights(residuals: Sequence[np.ndarray], *, together: bool) -> tuple[float, ...]:
+    """Powers of the likelihoods of groups whose ``residuals`` are (T, K_g): the part of their series that is
+    independent of others in the group; ``together``: and of the groups before, the first of which is the mean
+    motion."""
+    series = [independent_series(r) for r in residuals]
+    if together:
+        known = 0.0
+        for k in range(len(series)):
+            whole = max(independent_series(np.concatenate(residuals[: k + 1], axis=1)), known)
+            series[k] = min(series[k], max(whole - known, MIN_SERIES))
+            known = whole
+    return tuple(s / r.shape[1] for s, r in zip(series, residuals, strict=True))
+
+
+def independent_series(residual: np.ndarray) -> float:
+    """How many independent series the coefficients (T, K) of a residual are worth, of K: the participation ratio of
+    their covariance over the modes, corrected for how few instants show it.
+
+    What a simulation lacks moves all modes together: then they are one series, not K.
+    """
+    instants, count = residual.shape
+    power = np.linalg.svd(residual, compute_uv=False) ** 2
+    if power.sum() == 0.0:
+        return float(count)
+    inverse = float((power**2).sum() / power.sum() ** 2) - 1 / instants
+    return 1 / max(inverse, 1 / count)
+
+
+def jitter_of(residual: np.ndarray) -> float:
+    """Standard deviation [m] of the independent errors in coefficients (T, K) whose residual is else smooth. 0 if there
+    are too few instants to tell."""
+    if len(residual) < 2 * DIFFERENCES:
+        return 0.0
+    left = np.diff(residual, DIFFERENCES, axis=0)
+    return math.sqrt(float(np.median(left**2)) / CHI2_MEDIAN / DIFFERENCE_VARIANCE)
+
+
+def _grid_changes(
+    observation: Observation, modes: MotionModes, kept: np.ndarray, turned: np.ndarray | None
+) -> tuple[np.ndarray, ...]:
+    """By how much one more grid may differ from the mean of those that were tried, beyond it; it does not fall as time
+    goes on."""
+    if not observation.grid_corrections:
+        return tuple(np.zeros(len(kept)) for _ in modes.names)
+    count = len(observation.grid_corrections)
+    apart = [modes.coefficients((c - observation.grid_correction)[kept], turned) for c in observation.grid_corrections]
+    more = math.sqrt((count + 1) / (count - 1))
+    return tuple(
+        more * np.maximum.accumulate(np.sqrt(np.mean([(c[g] ** 2).mean(1) for c in apart], axis=0)))
+        for g in range(len(modes.names))
+    )
