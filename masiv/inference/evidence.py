@@ -21,7 +21,7 @@ STRENGTH_SCALES = 5
 NUISANCE_SD = 100.0
 """Prior standard deviation of what is fitted to one held-out observation alone, in its own unit: nothing is known."""
 
-GRAVITY, GRAVITY_SD = "gravity_scale.relative_change", 0.005
+GRAVITY_EFFECT, GRAVITY_SD = "gravity_scale", 0.005
 """Gravity on Earth varies by 0.5 % from the equator to the poles; the scale of a recording is hardly known better."""
 
 
@@ -80,7 +80,7 @@ class Evidence:
         mean = np.array([-linear.values[n] if n in strengths else 0.0 for n in names] + [0.0] * nuisance)
         flat = [
             GRAVITY_SD**-2
-            if p.name == GRAVITY and p.name not in strengths
+            if p.name.split(".")[0] == GRAVITY_EFFECT and p.name not in strengths
             else 12 / self.range_of(p, units.get(p.name)) ** 2
             for p in linear.parameters
         ]

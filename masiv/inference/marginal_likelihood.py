@@ -84,13 +84,14 @@ class SizePriors:
 
     def with_unknown(self, blocks: Sequence[ErrorBlock]) -> SizePriors:
         """If something unknown acts: it moves the body smoothly, by anything between an error and the whole motion
-        (a discrepancy of the model; Kennedy & O'Hagan 2001)."""
+        (a discrepancy of the model; Kennedy & O'Hagan 2001). These are two standard deviations from the mean of the
+        logarithm: it is unlikely that what acts moves the body by less than an error."""
         groups = len(self.mean) // 3
         largest = [max(b.motion for b in blocks if b.group == g) for g in range(groups)]
         half = 0.5 * np.log(largest)
         mean, sd = self.mean.copy(), self.sd.copy()
         mean[groups : 2 * groups] = half
-        sd[groups : 2 * groups] = np.maximum(half, SMOOTH_SD)
+        sd[groups : 2 * groups] = np.maximum(half / 2, SMOOTH_SD)
         return SizePriors(mean, sd)
 
     def starts(self) -> list[np.ndarray]:

@@ -11,7 +11,7 @@ import torch
 
 from masiv.effects.places import farthest_points
 from masiv.effects.smooth_force import STRENGTHS, acceleration
-from masiv.inference.model_fit import PARTS, split_fields
+from masiv.inference.model_fit import PARTS
 from masiv.refinement.discrepancy import DISCREPANCY_FORCE
 from masiv.refinement.result import RefineResult
 
@@ -85,10 +85,12 @@ def share(result: RefineResult) -> dict[str, float | None]:
     fitted = result.search.discrepancy
     assert fitted is not None
 
-    def part(before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float | None:
-        total = sum(float((f**2).sum()) for f in before)
-        return 1 - sum(float((f**2).sum()) for f in after) / total if total > 0 else None
+    def squares(fields: Sequence[np.ndarray], part: str) -> float:
+        pairs = zip(fields, result.observations, strict=True)
+        return sum(float((f[e.parts[part]] ** 2).sum()) for f, e in pairs if part in e.parts)
 
-    before = split_fields(result.after.fields, result.observations)
-    after = split_fields(fitted.fields, result.observations)
-    return {name: part(*fields) for name, *fields in zip(PARTS, before, after, strict=True)}
+    def removed(part: str) -> float | None:
+        before = squares(result.after.fields, part)
+        return 1 - squares(fitted.fields, part) / before if before > 0 else None
+
+    return {part: removed(part) for part in PARTS}

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from masiv.inference.evidence import Evidence
+from masiv.inference.evidence import GRAVITY_EFFECT, Evidence
 from masiv.inference.linear_model import LinearModel, linear_model
 from masiv.inference.marginal_likelihood import Marginal
 from masiv.inference.model_fit import ModelFit
 from masiv.models.base import ForwardModel
 
-GRAVITY_EFFECT = "gravity_scale"
 UNKNOWN = "something unknown"
 """Stands among effects for what no effect of the library is."""
 CREDIBLE = 0.95
