@@ -23,6 +23,7 @@ WAVES = 64
 NARROW = (0.3, 30.0)
 """Sizes of narrow strengths, in finite-difference steps of the effect."""
 FRAMES, FPS = 40, 60.0
+GRAVITY = "gravity_scale.relative_change"
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def _ball() -> tuple[Any, Any]:
 def flights(rng: np.random.Generator, *, with_effect: bool, narrow: bool) -> Draw:
     """A ball of 66 mm and 60 g, thrown at 3 to 8 m/s, for 40 frames at 60 Hz; jitter of 1 mm."""
     from masiv.identification.flights import fit_flights
-    from masiv.inference.evidence import GRAVITY, GRAVITY_SD
+    from masiv.inference.evidence import GRAVITY_SD
     from masiv.models.base import Model
     from masiv.models.point_mass import RIGID, PointMassModel, fly
     from masiv.observations.tracks import flight_noise
@@ -148,7 +149,7 @@ def linear(rng: np.random.Generator, *, with_effect: bool, narrow: bool) -> Draw
     """A clamped body of four modes that is let go, seen by 4 points for 30 frames at 60 Hz; jitter of 0.3 mm."""
     from modal_body import EFFECTS, RELEASED, SIDES, ModalBody
 
-    from masiv.inference.evidence import GRAVITY, GRAVITY_SD
+    from masiv.inference.evidence import GRAVITY_SD
     from masiv.inference.model_fit import gauss_newton_fit
     from masiv.models.base import Model
     from masiv.models.families import Family

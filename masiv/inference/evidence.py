@@ -10,7 +10,7 @@ import numpy as np
 
 from masiv.inference.error_covariance import ErrorBlock
 from masiv.inference.linear_model import LinearModel
-from masiv.inference.marginal_likelihood import Marginal, ParameterPriors, SizePriors, marginal, with_unknown
+from masiv.inference.marginal_likelihood import Marginal, ParameterPriors, SizePriors, marginal_with_unknown
 from masiv.inference.segments import Segment
 from masiv.models.base import EffectTerm
 from masiv.models.parameters import Parameter
@@ -42,19 +42,23 @@ class Evidence:
             segments = [replace(s, first_group=0) for s in segments]
         return cls(tuple(observations), tuple(segments))
 
-    def marginal(self, linear: LinearModel, terms: Sequence[EffectTerm], *, test: bool = False) -> Marginal:
+    def marginal(
+        self, linear: LinearModel, terms: Sequence[EffectTerm], *, test: bool = False, near: Marginal | None = None
+    ) -> Marginal:
         """The marginal likelihood of a model with the effects ``terms``; of the instants of the test as well if asked
-        for."""
-        return self.marginal_with(linear, self.priors(linear, terms), test=test)
+        for. near: that of a model which is little different."""
+        return self.marginal_with(linear, self.priors(linear, terms), test=test, near=near)
 
-    def marginal_with(self, linear: LinearModel, priors: ParameterPriors, *, test: bool = False) -> Marginal:
+    def marginal_with(
+        self, linear: LinearModel, priors: ParameterPriors, *, test: bool = False, near: Marginal | None = None
+    ) -> Marginal:
         """The same with other ``priors`` of its parameters."""
         blocks = self.blocks(linear)
-        sizes = SizePriors.of(blocks)
-        more = sizes.with_unknown(blocks)
+        known = SizePriors.of(blocks)
+        unknown = known.with_unknown(blocks)
         if test:
             blocks = self.blocks(linear, test=True)
-        return with_unknown(marginal(blocks, priors, sizes), marginal(blocks, priors, more))
+        return marginal_with_unknown(blocks, priors, known, unknown, (near.logs,) if near else ())
 
     def blocks(self, linear: LinearModel, *, test: bool = False) -> list[ErrorBlock]:
         """Of all observations; columns are the model's parameters, then the nuisance of each observation."""

@@ -27,6 +27,11 @@ JITTER_SD, SMOOTH_SD, GRID_SD = 0.7, 1.0, 0.5
 """Standard deviations of the logarithms of the factors: the expected sizes are good to a factor of two or three."""
 STARTS = ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.5, 0.0), (-2.0, 0.0, 0.5, 0.0), (-2.0, -1.0, -1.0, 3.0))
 """Where fits of the sizes begin, in standard deviations of their priors: jitter, smooth, length, grid."""
+REACH = 6.0
+"""How far sizes may be from what is expected, in standard deviations of the prior."""
+TOLERANCE = 1e-2
+"""Slope of the log density by a size, in standard deviations of the prior, at which their fit ends: the evidence is
+then known to about the square of it."""
 LOG2PI = math.log(2 * math.pi)
 
 
@@ -95,13 +100,10 @@ class SizePriors:
         return SizePriors(mean, sd)
 
     def starts(self) -> list[np.ndarray]:
-        """Sizes from which their fit begins: as expected, rough, smooth, and with more of another grid."""
+        """Sizes from which their fit begins, in standard deviations from the mean: as expected, rough, smooth, and with
+        more of another grid."""
         groups = len(self.mean) // 3
-        out = []
-        for jitter, smooth, length, grid in STARTS:
-            shift = np.concatenate([np.full(groups, jitter), np.full(groups, smooth), np.full(groups, length), [grid]])
-            out.append(self.mean + shift * self.sd)
-        return out
+        return [np.array([*np.repeat(start[:3], groups), start[3]]) for start in STARTS]
 
 
 def _interval(lags: np.ndarray) -> float:
@@ -196,27 +198,36 @@ class _Terms:
     gradient: np.ndarray | None = None
 
 
-def marginal(blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors) -> Marginal:
+def marginal(
+    blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, starts: Sequence[np.ndarray] = ()
+) -> Marginal:
     """The marginal likelihood of ``blocks``, over all of them: a composite likelihood (Varin, Reid & Firth 2011) if
-    their weights are not 1."""
+    their weights are not 1. starts: logarithms of the sizes (3 G + 1,) from which their fit begins; usual ones if there
+    are none."""
     likelihood = _Likelihood(blocks, priors, sizes)
-    reach = 6.0 * sizes.sd
-    bounds = list(zip(sizes.mean - reach, sizes.mean + reach, strict=True))
+
+    def objective(z: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = likelihood.objective(sizes.mean + sizes.sd * z)
+        return value, gradient * sizes.sd
+
     # The posterior has several modes: a rough residual is jitter, or smooth errors of a short time.
+    options = {"maxiter": 200, "gtol": TOLERANCE}
+    bounds = [(-REACH, REACH)] * len(sizes.mean)
     found = min(
         (
-            minimize(likelihood.objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 200})
-            for start in sizes.starts()
+            minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            for start in ([(s - sizes.mean) / sizes.sd for s in starts] or sizes.starts())
         ),
         key=lambda result: result.fun,
     )
-    hessian = _hessian(likelihood.objective, found.x, sizes.sd)
+    logs = sizes.mean + sizes.sd * found.x
+    hessian = _hessian(likelihood.objective, logs, sizes.sd)
     # Volume of the posterior of the sizes over that of their prior.
     volume = -0.5 * np.linalg.slogdet(hessian * np.outer(sizes.sd, sizes.sd))[1]
-    terms = likelihood.terms(found.x)
+    terms = likelihood.terms(logs)
     weights = np.exp(terms.logp - np.logaddexp.reduce(terms.logp))
     mean, spread = _moments(weights, terms.mean, terms.covariance)
-    return Marginal(-float(found.fun) + float(volume), priors.mean + mean, spread, found.x)
+    return Marginal(-float(found.fun) + float(volume), priors.mean + mean, spread, logs)
 
 
 def _moments(weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -226,12 +237,20 @@ def _moments(weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) ->
     return mean, np.tensordot(weights, covariances + apart[:, :, None] * apart[:, None, :], 1)
 
 
-def with_unknown(without: Marginal, unknown: Marginal) -> Marginal:
-    """Over whether something unknown acts, which is half as likely as that it does not (as one effect more is)."""
-    logs = np.array([without.log_evidence + math.log(2 / 3), unknown.log_evidence + math.log(1 / 3)])
+def marginal_with_unknown(
+    blocks: Sequence[ErrorBlock], priors: ParameterPriors, known: SizePriors, unknown: SizePriors,
+    starts: Sequence[np.ndarray] = (),
+) -> Marginal:  # fmt: skip
+    """Over whether something unknown acts, which is half as likely as that it does not (as one effect more is): then
+    the sizes have the prior ``unknown``, else ``known``."""
+    without = marginal(blocks, priors, known, starts)
+    groups = len(known.mean) // 3
+    larger = without.logs.copy()
+    larger[groups : 2 * groups] = unknown.mean[groups : 2 * groups]
+    parts = (without, marginal(blocks, priors, unknown, (without.logs, larger)))
+    logs = np.array([m.log_evidence + math.log(p) for m, p in zip(parts, (2 / 3, 1 / 3), strict=True)])
     total = float(np.logaddexp.reduce(logs))
     weights = np.exp(logs - total)
-    parts = (without, unknown)
     mean, spread = _moments(weights, np.stack([m.mean for m in parts]), np.stack([m.covariance for m in parts]))
     return Marginal(total, mean, spread, parts[int(weights.argmax())].logs, float(weights[1]))
 

@@ -116,28 +116,48 @@ def _weights(residuals: Sequence[np.ndarray], *, together: bool) -> tuple[float,
     """Powers of the likelihoods of groups whose ``residuals`` are (T, K_g): the part of their series that is
     independent of others in the group; ``together``: and of the groups before, the first of which is the mean
     motion."""
-    series = [independent_series(r) for r in residuals]
-    if together:
-        known = 0.0
-        for k in range(len(series)):
-            whole = max(independent_series(np.concatenate(residuals[: k + 1], axis=1)), known)
-            series[k] = min(series[k], max(whole - known, MIN_SERIES))
-            known = whole
+    if not together:
+        return tuple(independent_series(r, effective_instants(r)) / r.shape[1] for r in residuals)
+    # All instants count: what a simulation lacks is smooth, and few independent instants would show nothing.
+    series = [independent_series(r, len(r)) for r in residuals]
+    known = 0.0
+    for k in range(len(series)):
+        whole = max(independent_series(np.concatenate(residuals[: k + 1], axis=1), len(residuals[0])), known)
+        series[k] = min(series[k], max(whole - known, MIN_SERIES))
+        known = whole
     return tuple(s / r.shape[1] for s, r in zip(series, residuals, strict=True))
 
 
-def independent_series(residual: np.ndarray) -> float:
-    """How many independent series the coefficients (T, K) of a residual are worth, of K: the participation ratio of
-    their covariance over the modes, corrected for how few instants show it.
+def independent_series(residual: np.ndarray, instants: float) -> float:
+    r"""How many independent series the coefficients (T, K) of a residual are worth, of K: the participation ratio
+    :math:`(\operatorname{tr} C)^2 / \operatorname{tr} C^2` of their covariance C over the modes, of which T dependent
+    instants, worth ``instants`` independent ones, show a sample.
 
     What a simulation lacks moves all modes together: then they are one series, not K.
     """
-    instants, count = residual.shape
+    count = residual.shape[1]
     power = np.linalg.svd(residual, compute_uv=False) ** 2
     if power.sum() == 0.0:
         return float(count)
-    inverse = float((power**2).sum() / power.sum() ** 2) - 1 / instants
-    return 1 / max(inverse, 1 / count)
+    found = float((power**2).sum() / power.sum() ** 2)
+    # Second moments of the Wishart distribution: E tr C'^2 = (1 + 1/n) tr C^2 + (tr C)^2 / n of the sample C'.
+    inverse = (found - 1 / instants) / max(1 + (1 - 2 * found) / instants, 1 / instants)
+    return 1 / min(max(inverse, 1 / count), 1.0)
+
+
+def effective_instants(residual: np.ndarray) -> float:
+    """How many independent instants show as much of the covariance over the modes as the coefficients (T, K):
+    T^2 over the sum of the squared autocorrelation (Bartlett)."""
+    instants = len(residual)
+    spectrum = np.abs(np.fft.rfft(residual, 2 * instants, axis=0)) ** 2
+    covariance = np.fft.irfft(spectrum.sum(1))[:instants]
+    if covariance[0] <= 0:
+        return float(instants)
+    squares = (covariance / covariance[0]) ** 2
+    # The biased estimate has the factor 1 - lag/T once; a pair of instants of each lag exists as often.
+    lags = 1 - np.arange(instants) / instants
+    total = squares[0] + 2 * float((squares[1:] / np.maximum(lags[1:], 1 / instants)).sum())
+    return instants / total
 
 
 def jitter_of(residual: np.ndarray) -> float:

@@ -36,6 +36,13 @@ class Hypothesis:
     def law(self) -> str:
         return self.fitted.model.family.kind
 
+    @property
+    def distance_from_mean(self) -> float:
+        """Largest distance of a fitted value from its posterior mean, in standard deviations of the posterior."""
+        own = [k for k, p in enumerate(self.linear.parameters) if p.name in self.fitted.values]
+        spread = np.sqrt(np.diag(self.marginal.covariance)[own])
+        return float((np.abs(self.marginal.mean[own]) / spread).max(initial=0.0))
+
     def with_posterior(self) -> ModelFit:
         """The fit with the standard errors of the posterior, errors of law, initial state and noise included."""
         names = [p.name for p in self.linear.parameters]

@@ -10,6 +10,7 @@ import numpy as np
 
 from masiv.inference.evidence import Evidence, strength_scales
 from masiv.inference.linear_model import LinearModel, linear_model
+from masiv.inference.marginal_likelihood import Marginal
 from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.effect_fit import absent
 
@@ -49,10 +50,10 @@ def sensitivity(
 
 
 def upper_limit(
-    evidence: Evidence, at: LinearModel, terms: Sequence[EffectTerm], term: EffectTerm, log_evidence: float,
+    evidence: Evidence, at: LinearModel, terms: Sequence[EffectTerm], term: EffectTerm, here: Marginal,
     found: tuple[dict[str, float], LinearModel],
 ) -> UpperLimit:  # fmt: skip
-    """The limit of ``term`` in addition to the model ``at``, which has the effects ``terms`` and ``log_evidence``."""
+    """The limit of ``term`` in addition to the model ``at``, with the effects ``terms`` and the evidence ``here``."""
     values, columns = found
     joined = at.with_parameters(columns.model, values, columns)
     own = {p.name for p in columns.parameters}  # gravity is known to a part without being an effect
@@ -67,7 +68,7 @@ def upper_limit(
         parameters=tuple(joined.parameters[k] for k in kept),
         jacobians=[j[..., kept] for j in joined.jacobians],
     )
-    whole = evidence.marginal(joined, [*terms, term])
+    whole = evidence.marginal(joined, [*terms, term], near=here)
     priors = evidence.priors(joined, [*terms, term])
     names = [p.name for p in joined.parameters]
     # Along axes that were not measured nothing is seen.
@@ -76,7 +77,7 @@ def upper_limit(
         return UpperLimit.unknown(term.name, "it moves nothing along the axes that were measured")
     index = [names.index(term.strengths[k].name) for k in seen]
     # Of the widest prior of the strength: the limit is what the data say.
-    wide = evidence.marginal_with(joined, replace(priors, precision=priors.precision[-1:]))
+    wide = evidence.marginal_with(joined, replace(priors, precision=priors.precision[-1:]), near=here)
     mean, covariance = wide.mean[index], wide.covariance[np.ix_(index, index)]
     draws = np.random.default_rng(0).multivariate_normal(mean, covariance, DRAWS, method="eigh")
     possible = (draws >= np.array([term.strengths[k].lower for k in seen])).all(1)
@@ -87,4 +88,4 @@ def upper_limit(
     count = sum(f.shape[0] * f.shape[1] for f in columns.fields)
     motion = math.sqrt(float(np.quantile(squares, LEVEL)) / count)
     middle = math.sqrt(sum(float(np.median(strength_scales(p))) ** 2 for k in seen for p in [term.strengths[k]]))
-    return UpperLimit(term.name, size, 1e3 * motion, size < middle, whole.log_evidence - log_evidence)
+    return UpperLimit(term.name, size, 1e3 * motion, size < middle, whole.log_evidence - here.log_evidence)

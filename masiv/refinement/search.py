@@ -17,6 +17,7 @@ from masiv.refinement.discrepancy import discrepancy_force
 from masiv.refinement.effect_fit import BROYDEN_STEPS
 from masiv.refinement.hypotheses import linearized, log_prior
 from masiv.refinement.limits import UpperLimit, sensitivity, upper_limit
+from masiv.refinement.posterior_fit import posterior_fit
 from masiv.refinement.rounds import Check, Round, SearchResult
 from masiv.refinement.search_round import run_round
 from masiv.refinement.search_state import SearchSettings, SearchState
@@ -43,7 +44,8 @@ def search_effects(
     if settings.rank_only:
         return SearchResult(state.forward_model, before, before, tuple(rounds), whitened_before=start.forward_model)
     null = rounds[0].posterior.with_at_most(0) if rounds and rounds[0].posterior else 1.0
-    after = state.fit if state.fit.model.effects else before
+    before, found = posterior_fit(start.forward_model, before, start.robust_scale), state.fit
+    after = posterior_fit(state.forward_model, found, state.robust_scale) if found.model.effects else before
     checked = {"before": _check(start, before)}
     checked["after"] = checked["before"] if after is before else _check(state, after)
     discrepancy = None
@@ -159,7 +161,7 @@ def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchS
     line = linearized(model, fitted)
     terms = [model.term(n) for n in fitted.model.effects]
     evidence = Evidence.of(model.observations, line.fields)
-    here = evidence.marginal(line, terms).log_evidence
+    here = evidence.marginal(line, terms)
     label = "refine: upper limits"
     settings.progress(label, 0, len(names))
     out = []
