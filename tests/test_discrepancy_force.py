@@ -60,7 +60,7 @@ def test_a_gust_is_found_where_when_and_along_what_it_blew(axes):
     force = written["discrepancy_force"]
     assert force["in_twin"]
     assert force["share"]["fit"] > 0.99
-    assert force["share"]["held_out"] > 0.9
+    assert force["share"]["validation"] > 0.9
     peak = force["peak"]
     assert GUST[0] - INTERVAL < peak["time"]["value"] < GUST[1] + INTERVAL
     assert cosine(peak["direction"], PUSH) > 0.95

@@ -59,11 +59,13 @@ def search_of(forward_model):
     candidate = Candidate("linear_drag", 0.9, {}, {}, np.zeros((0, 0)), np.zeros(0))
     family = Family("rigid", (), {})
     fits = [
-        ModelFit(Model(family, "none", (name,)), {}, (), np.zeros(0), np.zeros((0, 0)), 1.0, 9, 1.0, 1.0, [], {})
+        ModelFit(Model(family, "none", (name,)), {}, (), np.zeros(0), np.zeros((0, 0)), 1.0, 9, 1.0, 1.0, None, [], {})
         for name in ("linear_drag", "quadratic_drag")
     ]
     trials = tuple(Trial(candidate, fitted) for fitted in fits)
-    hypotheses = [Hypothesis(f, UNUSED, SimpleNamespace(log_evidence=float(k))) for k, f in enumerate(fits)]
+    hypotheses = [
+        Hypothesis(f, UNUSED, SimpleNamespace(log_evidence=float(k), unknown=0.0)) for k, f in enumerate(fits)
+    ]
     first = Round(UNUSED, Ranking(), trials, trials[0], Posterior.of(hypotheses, 2))
     return SearchResult(forward_model, trials[0].fitted, trials[0].fitted, (first,))
 

@@ -68,6 +68,7 @@ def fields(instants=16, fitted=12, particles=90):
     return {
         "observations": np.array(["run"]), "before@run": before, "after@run": 0.3 * before, "points@run": positions,
         "times@run": np.arange(1, instants + 1) / 24, "fit_count@run": np.array(fitted),
+        "test_count@run": np.array((instants - fitted) // 2),
     }  # fmt: skip
 
 
@@ -112,7 +113,7 @@ def test_nothing_found(tmp_path):
     write(tmp_path, found, fields(instants=12, fitted=12))
     section = section_of(tmp_path)
     assert "nothing missing" in section
-    assert [text for text in ("What was added", "held out", "Refits", "finer grids") if text in section] == []
+    assert [text for text in ("What was added", "on validation", "Refits", "finer grids") if text in section] == []
 
 
 def test_a_discrepancy_force_is_no_cause(tmp_path):
@@ -123,12 +124,20 @@ def test_a_discrepancy_force_is_no_cause(tmp_path):
         "unit": {},
         "fit_rmse_mm": 3.25,
         "validation_rmse_mm": 9.75,
+        "test_rmse_mm": None,
+        "share": {"fit": 0.876, "validation": 0.54, "test": None},
+        "peak": None,
+        "in_twin": False,
     }
-    write(tmp_path, document(accepted=[], verdict="unexplained residual", discrepancy_force=force), fields())
+    arrays = fields()
+    places = np.tile(arrays["points@run"][:20], (16, 1, 1))
+    places[3, :5] = np.nan  # hidden
+    arrays |= {"force_places@run": places, "force@run": 0.5 + places**2}
+    write(tmp_path, document(accepted=[], verdict="unexplained residual", discrepancy_force=force), arrays)
     section = section_of(tmp_path)
-    assert [
-        t for t in ("unexplained residual", "without a known cause", "3.25", "9.75 mm held out") if t not in section
-    ] == []
+    shown = ("unexplained residual", "without a known cause", "3.25", "9.75 mm (validation)", "88 %", "54 %", "worse")
+    assert [t for t in shown if t not in section] == []
+    assert section.count("data:image/png;base64,") == 3
 
 
 def test_absent_and_unreadable(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 BLUE, ORANGE, GREEN, GREY = "#2563a8", "#d97706", "#2f855a", "#8a8f98"
 
 
-def _figure(columns: int = 1, rows: int = 1, size: tuple[float, float] = (5.2, 3.2)) -> tuple[Any, Any]:
+def new_figure(columns: int = 1, rows: int = 1, size: tuple[float, float] = (5.2, 3.2)) -> tuple[Any, Any]:
     """A figure of panels of ``size`` [inches], and its axes: of the one row, or (rows, columns)."""
     import matplotlib
 
@@ -26,7 +26,7 @@ def _figure(columns: int = 1, rows: int = 1, size: tuple[float, float] = (5.2, 3
     return figure, axes[0] if rows == 1 else axes
 
 
-def _png(figure: Any) -> bytes:
+def to_png(figure: Any) -> bytes:
     from matplotlib import pyplot
 
     buffer = io.BytesIO()
@@ -37,20 +37,20 @@ def _png(figure: Any) -> bytes:
 
 def loss_curves(curves: Mapping[str, tuple[Sequence[int], Sequence[float], str]]) -> bytes:
     """One panel a stage: its reported number over iterations; logarithmic where all are positive."""
-    figure, axes = _figure(len(curves))
+    figure, axes = new_figure(len(curves))
     for axis, (stage, (iterations, values, label)) in zip(axes, curves.items(), strict=True):
         axis.plot(iterations, values, color=BLUE)
         axis.set(title=stage, xlabel="iteration", ylabel=label[:40] or "reported value")
         if min(values) > 0 and max(values) > 3 * min(values):
             axis.set_yscale("log")
-    return _png(figure)
+    return to_png(figure)
 
 
 def centroid_path(
     motions: Mapping[str, tuple[np.ndarray, np.ndarray]], up: np.ndarray, fit_until: float | None
 ) -> bytes:
     """Height and horizontal travel of the centroid over time. ``motions``: name -> (positions (T, Q, 3) [m], times)."""
-    figure, (height, travel) = _figure(2)
+    figure, (height, travel) = new_figure(2)
     for colour, (name, (positions, times)) in zip((BLUE, ORANGE, GREEN, GREY), motions.items(), strict=False):
         centre = positions.mean(axis=1, dtype=np.float64)
         along = centre @ up
@@ -62,21 +62,21 @@ def centroid_path(
     for axis in (height, travel):
         _mark_fit(axis, fit_until, "last fitted frame")
     height.legend(frameon=False)
-    return _png(figure)
+    return to_png(figure)
 
 
 def over_frames(
     curves: Mapping[str, tuple[Sequence[int], Sequence[float | None]]], title: str, unit: str, fit: int
 ) -> bytes:
     """Curves over frames; ``fit`` is the number of fitted frames."""
-    figure, (axis,) = _figure(1)
+    figure, (axis,) = new_figure(1)
     for colour, (name, (frames, values)) in zip((BLUE, ORANGE, GREEN, GREY), curves.items(), strict=False):
         shown = [np.nan if value is None else value for value in values]
         axis.plot(frames, shown, color=colour, label=name, marker="o", markersize=3)
     axis.set(title=title, xlabel="frame", ylabel=unit)
     _mark_fit(axis, fit - 0.5, "end of the fit")
     axis.legend(frameon=False)
-    return _png(figure)
+    return to_png(figure)
 
 
 def law_curves(law: Any) -> bytes:
@@ -88,7 +88,7 @@ def law_curves(law: Any) -> bytes:
     stretch, shear, volume = eye.clone(), eye.clone(), eye * (1 + amount)[:, None, None] ** (1 / 3)
     stretch[:, 0, 0] += amount
     shear[:, 0, 1] += amount
-    figure, axes = _figure(3)
+    figure, axes = new_figure(3)
     panels = (
         ("stretch of one axis, others held", "stretch − 1", stretch, (0, 0)),
         ("simple shear", "shear", shear, (0, 1)),
@@ -101,12 +101,12 @@ def law_curves(law: Any) -> bytes:
         axis.plot(amount.numpy(), stress, color=BLUE)
         axis.set(title=title, xlabel=label, ylabel="Kirchhoff stress [kPa]")
         axis.axhline(0, color=GREY, linewidth=0.7)
-    return _png(figure)
+    return to_png(figure)
 
 
 def material_curves(curves: Mapping[str, Mapping[str, Any]]) -> bytes:
     """Stress over strain, one panel for each curve of ``describe.Material``; grey beyond the observed range."""
-    figure, axes = _figure(len(curves))
+    figure, axes = new_figure(len(curves))
     for axis, (name, curve) in zip(axes, curves.items(), strict=True):
         strain, stress = np.asarray(curve["strain"]), np.asarray(curve["stress_pa"]) / 1e3
         low, high = curve["observed"]
@@ -119,7 +119,7 @@ def material_curves(curves: Mapping[str, Mapping[str, Any]]) -> bytes:
         axis.set(title=name.replace(", there", ",\nthere"), xlabel="strain", ylabel="Kirchhoff stress [kPa]")
         axis.axhline(0, color=GREY, linewidth=0.5)
     axes[0].legend(frameon=False, fontsize=8)
-    return _png(figure)
+    return to_png(figure)
 
 
 def residual_in_time(
@@ -127,14 +127,8 @@ def residual_in_time(
 ) -> bytes:
     """Residuals. curves: name -> (K, N, 3) [m] at ``times`` (K,) [s], of which the first ``fitted`` were fitted and the
     last ``test`` are for the test."""
-    figure, (axis,) = _figure(1, size=(7.2, 3.4))
-    half = (times[1] - times[0]) / 2 if len(times) > 1 else times[0] / 2
-    edges = [0, fitted, len(times) - test, len(times)]
-    parts = (("fitted", BLUE, 0.07), ("validation", ORANGE, 0.12), ("test", GREY, 0.2))
-    for first, last, (label, colour, alpha) in zip(edges[:-1], edges[1:], parts, strict=True):
-        if first < last:
-            begin, end = times[first] - half, times[last - 1] + half
-            axis.axvspan(begin, end, color=colour, alpha=alpha, linewidth=0, label=label)
+    figure, (axis,) = new_figure(1, size=(7.2, 3.4))
+    half = shade_parts(axis, times, fitted, test)
     axis.axhline(noise_mm, color=GREY, linestyle="--", linewidth=1.2, label="noise floor")
     for colour, (name, field) in zip((ORANGE, BLUE), curves.items(), strict=False):
         rms = 1e3 * np.sqrt((field.astype(np.float64) ** 2).sum(2).mean(1))
@@ -142,7 +136,20 @@ def residual_in_time(
     axis.set(xlabel="time [s]", ylabel="residual, RMS over particles [mm]", xlim=(times[0] - half, times[-1] + half))
     axis.set_ylim(bottom=0)
     figure.legend(frameon=False, fontsize=8, loc="outside right center")
-    return _png(figure)
+    return to_png(figure)
+
+
+def shade_parts(axis: Any, times: np.ndarray, fitted: int, test: int) -> float:
+    """Shade the instants ``times`` (K,) [s] that were fitted, those for validation and the last ``test`` ones for the
+    test. Returns half the interval [s]."""
+    half = (times[1] - times[0]) / 2 if len(times) > 1 else times[0] / 2
+    edges = [0, fitted, len(times) - test, len(times)]
+    parts = (("fitted", BLUE, 0.07), ("validation", ORANGE, 0.12), ("test", GREY, 0.2))
+    for first, last, (label, colour, alpha) in zip(edges[:-1], edges[1:], parts, strict=True):
+        if first < last:
+            begin, end = times[first] - half, times[last - 1] + half
+            axis.axvspan(begin, end, color=colour, alpha=alpha, linewidth=0, label=label)
+    return half
 
 
 ARROW_CELLS = 7
@@ -164,7 +171,7 @@ def residual_in_space(
     level = [axis for axis in range(3) if axis != upright]
     extent = np.ptp(positions, axis=0)
     height = 4.0 * float(extent[upright] / max(extent[level].max(), 1e-9)) + 0.9
-    figure, panels = _figure(2, len(fields), size=(4.9, min(max(height, 2.2), 6.0)))
+    figure, panels = new_figure(2, len(fields), size=(4.9, min(max(height, 2.2), 6.0)))
     shown = None
     for row, (name, field) in zip(np.reshape(panels, (-1, 2)), fields.items(), strict=True):
         worst = int((size[name] ** 2).mean(1).argmax())
@@ -184,7 +191,7 @@ def residual_in_space(
             if up is not None and up[upright] < 0:
                 axis.invert_yaxis()
     figure.colorbar(shown, ax=panels, label="residual of a particle, RMS over time [mm]", extend="max", shrink=0.8)
-    return _png(figure)
+    return to_png(figure)
 
 
 def _cell_means(points: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:

@@ -13,11 +13,14 @@ import numpy as np
 from masiv.errors import InputError
 from masiv.refinement.answer import answer, outcome, words
 from masiv.report import plots
+from masiv.report.force_plot import force_in_time_and_space
 from masiv.report.page import Page, Share, number
 
 REFINED, FIELDS = "refine.json", "refine.npz"
 PARTS = {"fit": "fitted", "validation": "validation", "test": "test"}
 """Of the instants, in words."""
+FORCE = ("force", "force_places")
+"""Arrays of refine.npz that are there if there is a discrepancy force."""
 METRICS = {
     "trajectory_rmse_mm": ("distance to the observed motion, RMS", "mm"),
     "chamfer_1e3mm2": ("chamfer distance to the observed motion", "10³ mm²"),
@@ -38,6 +41,7 @@ def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | No
             first = str(file["observations"][0])
             names = ("before", "after", "points", "times", "fit_count", "test_count")
             fields = {name: file[f"{name}@{first}"] for name in names}
+            fields |= {name: file[f"{name}@{first}"] for name in FORCE if f"{name}@{first}" in file}
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise InputError(f"{run / REFINED} and {FIELDS} cannot be read ({error}): run masiv refine again") from error
     if not isinstance(document, dict) or document.get("schema") != 4:
@@ -64,7 +68,9 @@ def refinement_section(
     _before_after(page, document["before"], document["after"])
     _accepted(page, document["accepted"])
     _bodies(page, document.get("bodies") or {})
-    _unexplained(page, document["unexplained"], document["discrepancy_force"])
+    _unexplained(page, document["unexplained"])
+    if document["discrepancy_force"] is not None:
+        _discrepancy_force(page, document["discrepancy_force"], fields, up)
     _next_experiment(page, document.get("next_experiment"))
 
 
@@ -265,7 +271,7 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
     page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
 
 
-def _unexplained(page: Page, left: Mapping[str, Any], force: Mapping[str, Any] | None) -> None:
+def _unexplained(page: Page, left: Mapping[str, Any]) -> None:
     page.subheading("What stays unexplained")
     page.table(
         ["quantity", "value", "unit"],
@@ -278,14 +284,31 @@ def _unexplained(page: Page, left: Mapping[str, Any], force: Mapping[str, Any] |
             ["residual of that tenth, RMS", _number(left["worst_place_rmse_mm"]), "mm"],
         ],
     )
-    if force is not None:
-        errors = f"{number(_number(force['fit_rmse_mm']))} mm"
-        if force["validation_rmse_mm"] is not None:
-            errors += f", {number(_number(force['validation_rmse_mm']))} mm validation"
-        page.note(
-            "A force that changes smoothly in time and space and stands in for the discrepancy, without a known cause, "
-            f"leaves {errors}. The twin has it as smooth force, to be used meanwhile; it holds for this motion alone."
-        )
+
+
+def _discrepancy_force(
+    page: Page, force: Mapping[str, Any], fields: Mapping[str, np.ndarray] | None, up: np.ndarray | None
+) -> None:
+    page.subheading("A force without a known cause")
+    errors = [f"{number(_number(force['fit_rmse_mm']))} mm ({PARTS['fit']})"] + [
+        f"{number(_number(force[f'{part}_rmse_mm']))} mm ({PARTS[part]})"
+        for part in ("validation", "test")
+        if force[f"{part}_rmse_mm"] is not None
+    ]
+    shares = [f"{100 * s:.0f} % ({PARTS[part]})" for part, s in force["share"].items() if s is not None]
+    use = (
+        "The twin has it as smooth force, to be used meanwhile; it holds for this motion alone."
+        if force["in_twin"]
+        else "The twin does not have it: it makes the frames for validation worse."
+    )
+    page.note(
+        "A force that changes smoothly in time and space stands in for what no effect explains. It leaves "
+        f"{', '.join(errors)}; share of the residual that it removes: {', '.join(shares)}. {use}"
+    )
+    if fields is not None and "force" in fields:
+        counts = int(fields["fit_count"]), int(fields["test_count"])
+        drawn = force_in_time_and_space(fields["force"], fields["force_places"], fields["times"], *counts, up)
+        page.picture(drawn, "discrepancy force")
 
 
 def _next_experiment(page: Page, proposal: Mapping[str, Any] | None) -> None:
