@@ -15,7 +15,7 @@ def refine(
     second: Annotated[
         Path | None,
         typer.Option(
-            "--second-run", help="Another recording of the same object: fitted jointly, and held out as well."
+            "--second-run", help="Another recording of the same object: fitted jointly, and split in the same way."
         ),
     ] = None,
     group: Annotated[

@@ -1,4 +1,4 @@
-"""The stage: residual -> ranked effects -> joint refits -> what held-out data confirms."""
+"""The stage: residual -> ranked effects -> joint refits -> what the evidence confirms."""
 
 from __future__ import annotations
 
