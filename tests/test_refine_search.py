@@ -171,6 +171,46 @@ def test_nothing_is_accepted_if_there_is_nothing_to_compare_it_with():
         refined(model, {"effects": ["body_force"]})
 
 
+def noisy(truth, noise, seed):
+    """Points whose own errors are large: an effect explains little of the whole residual."""
+    model = LinearModel(truth, noise=noise, seed=seed)
+    (own,) = model.observations
+    ratio = noise / NOISE
+    return model.with_observations(
+        [replace(own, noise_std=noise, residual_std=ratio * own.residual_std, observation_std=np.zeros(0))]
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_explains_a_small_part_of_large_errors_is_named_if_it_is_evident(seed):
+    """The errors of points average out over the body, its motion does not."""
+    model = noisy({"linear_drag.strength": 0.035, "velocity_z": 0.3}, 30 * NOISE, seed)
+    result = refined(model)
+    assert result.search.rounds[0].candidates[0].explained < RefineConfig().min_explained
+    assert [t.name for t in result.accepted] == ["linear_drag"]
+    nothing = refined(noisy({"velocity_z": 0.3}, 30 * NOISE, seed))
+    assert (nothing.verdict, nothing.accepted) == ("nothing missing", ())
+
+
+class Stuck(LinearModel):
+    """A fit with a body force never leaves its start: its motion does not change with small strengths."""
+
+    def fields(self, model, values, *, held_out=False):
+        name = "body_force.strength"
+        ranked = abs(values.get(name, 0.0)) <= 0.011  # about zero, where the score test looks
+        kept = values if ranked or name not in values else {**values, name: 0.0}
+        return super().fields(model, kept, held_out=held_out)
+
+
+def test_a_fit_that_falls_short_says_nothing_against_its_effect():
+    result = refined(Stuck({"body_force.strength": 0.3, "velocity_z": 0.3}), {"effects": ["body_force"]})
+    (refit,) = document(result)["rounds"][0]["refits"]
+    assert not refit["converged"]
+    assert result.accepted == ()
+    assert result.verdict in ("cannot tell", "unexplained residual")
+    assert result.search.null_probability < 0.05
+
+
 def test_noise_is_no_outlier_in_any_observation():
     """Whitened residuals of an observation have its own noise."""
     model = LinearModel({"velocity_z": 0.3})

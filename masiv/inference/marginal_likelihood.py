@@ -27,6 +27,8 @@ JITTER_SD, SMOOTH_SD, GRID_SD = 0.7, 1.0, 0.5
 """Standard deviations of the logarithms of the factors: the expected sizes are good to a factor of two or three."""
 STARTS = ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.5, 0.0), (-2.0, 0.0, 0.5, 0.0), (-2.0, -1.0, -1.0, 3.0))
 """Where fits of the sizes begin, in standard deviations of their priors: jitter, smooth, length, grid."""
+MAX_FITS = 2
+"""Of which the most probable ones go on."""
 REACH = 6.0
 """How far sizes may be from what is expected, in standard deviations of the prior."""
 TOLERANCE = 1e-2
@@ -213,10 +215,11 @@ def marginal(
     # The posterior has several modes: a rough residual is jitter, or smooth errors of a short time.
     options = {"maxiter": 200, "gtol": TOLERANCE}
     bounds = [(-REACH, REACH)] * len(sizes.mean)
+    tried = [(s - sizes.mean) / sizes.sd for s in starts] or sizes.starts()
     found = min(
         (
             minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-            for start in ([(s - sizes.mean) / sizes.sd for s in starts] or sizes.starts())
+            for start in sorted(tried, key=lambda z: objective(z)[0])[:MAX_FITS]
         ),
         key=lambda result: result.fun,
     )

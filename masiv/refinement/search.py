@@ -43,15 +43,19 @@ def search_effects(
     before = rounds[0].base if rounds else start.fit
     if settings.rank_only:
         return SearchResult(state.forward_model, before, before, tuple(rounds), whitened_before=start.forward_model)
-    null = rounds[0].posterior.with_at_most(0) if rounds and rounds[0].posterior else 1.0
-    before, found = posterior_fit(start.forward_model, before, start.robust_scale), state.fit
-    after = posterior_fit(state.forward_model, found, state.robust_scale) if found.model.effects else before
+    before = posterior_fit(start.forward_model, before, start.robust_scale)
+    after, limits = _settled(state, before, rounds, settings)
+    overlooked = [state.forward_model.term(name).effect for name in _overlooked(rounds, limits, settings)]
+    if overlooked and len(after.model.effects) < len(before.model.effects) + settings.max_effects:
+        state, more = _add_effects(state.with_fit(after), [after], settings.for_effects(overlooked))
+        rounds += more
+        after, limits = _settled(state, before, rounds, settings)
     checked = {"before": _check(start, before)}
     checked["after"] = checked["before"] if after is before else _check(state, after)
     discrepancy = None
     if settings.discrepancy_force and checked["after"].p < settings.config.min_predictive_p:
         discrepancy = discrepancy_force(state.with_fit(after), settings)
-    limits = _upper_limits(state.with_fit(after), rounds, settings)
+    null = min((r.posterior.with_at_most(0) for r in rounds if r.posterior and not r.base.model.effects), default=1.0)
     if after is before:
         null = _with_unfitted(null, rounds, limits)
     unknown = rounds[-1].posterior.unknown() if rounds and rounds[-1].posterior else 0.0
@@ -116,10 +120,33 @@ def _add_effects(
     return state, rounds
 
 
+def _settled(
+    state: SearchState, before: ModelFit, rounds: Sequence[Round], settings: SearchSettings
+) -> tuple[ModelFit, list[UpperLimit]]:
+    """The final model with values of its posterior, ``before`` if nothing was added; and limits of all else."""
+    added = len(state.fit.model.effects) > len(before.model.effects)
+    after = posterior_fit(state.forward_model, state.fit, state.robust_scale) if added else before
+    return after, _upper_limits(state.with_fit(after), rounds, settings)
+
+
+def _overlooked(rounds: Sequence[Round], limits: Sequence[UpperLimit], settings: SearchSettings) -> list[str]:
+    """Effects that would be named if the linear model of the limits were right, and were not fitted, or in vain: the
+    ranking counts what an effect explains of all errors, most of which may not be of its kind."""
+    known = _weighed_effects(rounds) | {f.effect for r in rounds for f in r.failures}
+    named = math.log(1 / settings.config.max_null_probability - 1)
+    once = log_prior(1, len(limits)) - log_prior(0, len(limits)) if limits else 0.0
+    return [x.effect for x in limits if x.effect not in known and x.log_bayes_factor + once > named]
+
+
+def _weighed_effects(rounds: Sequence[Round]) -> set[str]:
+    """Effects whose refit reached what the ranking promised and has an evidence: only these can be told not to act."""
+    return {t.effect for r in rounds for t in r.trials if t.log_bayes_factor is not None and t.converged}
+
+
 def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperLimit]) -> float:
-    """Probability that no effect acts, effects that were not fitted through the rollout included: their evidence is
-    that of the linear model."""
-    fitted = {t.effect for r in rounds for t in r.trials if t.log_bayes_factor is not None}
+    """Probability that no effect acts, effects that were not fitted through the rollout, or in vain, included: their
+    evidence is that of the linear model."""
+    fitted = _weighed_effects(rounds)
     once = math.exp(log_prior(1, len(limits)) - log_prior(0, len(limits))) if limits else 0.0
     odds = (
         1 / max(null, 1e-300)

@@ -29,6 +29,8 @@ FALSE_MINIMUM_RATIO = 0.5
 """A model with one more effect that has less than this part of its base's cost may have got out of a false minimum."""
 MAX_PROMISE_ERROR = 1.5
 """Factor by which a ranking, which is linear, may have underestimated an effect."""
+LONGER_BUDGET = 3
+"""Derivatives that a fit may take that has not reached what the ranking promised."""
 WIDER_REDUCED_CHI = 1.2
 """Residual of the best trial over its standard deviation above which twice as many effects are fitted."""
 
@@ -40,6 +42,7 @@ def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSet
     trials, current = rank_trials(attempts.trials), state.fit
     if trials:
         trials = rank_trials(_refit_simpler(state, trials, settings))
+        trials = rank_trials(_refit_unconverged(state, trials, bases, settings))
         if current.model.effects:
             current = _restart_base(state, trials[0].fitted)
     ranking = _with_inapplicable(state, attempts.ranking, settings)
@@ -236,6 +239,47 @@ def _refit_from(
         forward_model, fitted.model, values, budget=budget, robust_scale=robust_scale,
         held=held_parameters(forward_model, fitted),
     )  # fmt: skip
+
+
+def _refit_unconverged(
+    state: SearchState, trials: Sequence[Trial], bases: Sequence[ModelFit], settings: SearchSettings
+) -> list[Trial]:
+    """Trials, best first, of which those that have not reached what the ranking promised go on with fresh derivatives:
+    from where they ended, and from where the best with the same law did."""
+    failed = [t for t in trials if not _converged(t, bases)]
+    best = {law: next(t.fitted for t in trials if t.law == law) for law in {t.law for t in trials}}
+    tasks = [(t.fitted, best[t.law], state.robust_scale) for t in failed]
+    again: dict[int, ModelFit] = {}
+    results = map_tasks(settings.workers, state.forward_model, _refit_longer, tasks)
+    for done, (trial, fit) in enumerate(zip(failed, results, strict=True)):
+        settings.progress("refine: fit again what fell short", done + 1, len(failed), trial.effect)
+        if not isinstance(fit, TaskError):
+            again[id(trial)] = min(fit, trial.fitted, key=lambda f: f.cost)
+    return [replace(t, fitted=again.get(id(t), t.fitted)) for t in trials]
+
+
+def _refit_longer(forward_model: ForwardModel, fitted: ModelFit, best: ModelFit, robust_scale: float) -> ModelFit:
+    """The better of ``fitted`` fitted on, and from what it shares with ``best``. Raises MasivError if neither start can
+    be simulated."""
+    own = {p.name for p in fitted.parameters}
+    shared = {p.name: best.values[p.name] for p in best.parameters if p.name in own}
+    starts = [fitted.values] if best is fitted else [fitted.values, {**fitted.values, **shared}]
+    fits: list[ModelFit] = []
+    failed: MasivError | None = None
+    for values in starts:
+        try:
+            fits.append(
+                gauss_newton_fit(
+                    forward_model, fitted.model, values, budget=LONGER_BUDGET * (len(fitted.parameters) + 2),
+                    robust_scale=robust_scale, held=held_parameters(forward_model, fitted),
+                )
+            )  # fmt: skip
+        except MasivError as error:
+            failed = error
+    if not fits:
+        assert failed is not None
+        raise failed
+    return min(fits, key=lambda f: f.cost)
 
 
 def _restart_base(state: SearchState, best: ModelFit) -> ModelFit:

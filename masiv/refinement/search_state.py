@@ -40,6 +40,11 @@ class SearchSettings:
             workers or Workers(), progress,
         )  # fmt: skip
 
+    def for_effects(self, effects: Sequence[str]) -> SearchSettings:
+        """With ``effects`` alone, whatever part of the residual they explain."""
+        config = self.config.model_copy(update={"effects": sorted(set(effects)), "min_explained": 0.0})
+        return replace(self, config=config)
+
     def considered(self, forward_model: ForwardModel, model: Model) -> list[str]:
         """Terms that may be added to ``model``, of the effects that the configuration names, in its order."""
         names = forward_model.candidates(model)
