@@ -23,6 +23,7 @@ from masiv.refinement.discrepancy_field import peak, sampled_fields, share
 from masiv.refinement.limits import UpperLimit
 from masiv.refinement.result import ADDED, NOTHING, RANKED, BodyResult, Proposal, RefineResult, SharedFit
 from masiv.refinement.rounds import Round, Trial, alternatives
+from masiv.refinement.world_vectors import vectors_in_world
 
 SCHEMA = 4
 WORST_POINTS = 0.1
@@ -167,6 +168,7 @@ def _accepted(result: RefineResult, term: EffectTerm, fitted: ModelFit) -> dict[
         "scope": scope_of(term),
         "bodies": list(term.bodies),
         **_parameters(term, fitted),
+        "world": vectors_in_world(term, fitted.values, fitted.stderr, result.forward_model.effect_axes(0)),
         "indistinguishable_from": list(others),
         "alternatives": others,
         **({} if place is None else {"place_in_body": {"value": list(place), "unit": "m"}}),
@@ -365,6 +367,11 @@ def text(document: Mapping[str, Any]) -> str:
     for a in shown["accepted"]:
         values = ", ".join(f"{n} {v:.4g}{_plus_minus(a['stderr'][n])} {a['unit'][n]}" for n, v in a["theta"].items())
         lines.append(f"{a['effect']}: {values}" + _looks_like(a["indistinguishable_from"]))
+        lines += [
+            f"  {name} in the axes of the scene ({', '.join(f'{v:.3g}' for v in q['value'])}) {q['unit']}"
+            for name, q in a["world"].items()
+            if q["unit"] != "1"
+        ]
     lines.append(f"before {_parts_mm(before)}; after {_parts_mm(after)}")
     force = shown["discrepancy_force"]
     if force is not None:

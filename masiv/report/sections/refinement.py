@@ -269,6 +269,13 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
         ],
     )
     page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
+    rows = [
+        [_name(a), words(n), q["value"], q["stderr"], _unit(q["unit"])]
+        for a in accepted
+        for n, q in a.get("world", {}).items()
+    ]
+    if rows:
+        page.table(["effect", "in the axes of the scene", "value", "standard error", "unit"], rows)
 
 
 def _unexplained(page: Page, left: Mapping[str, Any]) -> None:
