@@ -75,7 +75,8 @@ def forecast(
     for b, p, (mean, covariance) in zip(blocks, past, later, strict=True):
         jacobian, residual = b.jacobian[len(p.residual) :], b.residual[len(p.residual) :]
         spread = np.einsum("tki,ij,tkj->tk", jacobian, decided.covariance, jacobian)
-        expected += float((mean**2 + np.diag(covariance)[:, None] + spread).sum())
+        shift = jacobian @ decided.mean  # the fit need not be at the mean of the posterior
+        expected += float(((mean - shift) ** 2 + np.diag(covariance)[:, None] + spread).sum())
         found += float((residual**2).sum())
         instants += len(residual) if b.group % groups == 0 else 0
     if not instants:

@@ -25,7 +25,6 @@ from masiv.inference.model_fit import ModelFit, evaluate_fit
 from masiv.inference.robust import soft_l1_mean_square, soft_l1_weight
 from masiv.models.base import EffectTerm, ForwardModel, Model
 from masiv.models.parameters import Parameter
-from masiv.refinement.hypotheses import linearized
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks
 from masiv.workers import unwrap
@@ -80,7 +79,9 @@ class _Fit:
     def of(cls, state: SearchState, settings: SearchSettings, label: str) -> _Fit:
         """Raises NonFiniteError."""
         term = state.forward_model.term(DISCREPANCY_FORCE)
-        return cls(state, settings, term, linearized(state.forward_model, state.fit), label)
+        model, fit = state.forward_model, state.fit
+        parameters = [p for p in model.parameters(fit.model) if p.name in fit.values]
+        return cls(state, settings, term, linear_model(model, fit.model, fit.values, parameters), label)
 
     @property
     def forward_model(self) -> ForwardModel:

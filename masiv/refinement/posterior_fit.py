@@ -18,9 +18,10 @@ CLOSE = 0.1
 
 
 def posterior_fit(forward_model: ForwardModel, fitted: ModelFit, robust_scale: float) -> ModelFit:
-    """``fitted`` moved to the mean of its posterior, with the standard errors of the posterior. A step that leads
-    farther from the mean, as seen from where it ends, is not taken. Raises NonFiniteError if ``fitted`` cannot be
-    linearised."""
+    """``fitted`` moved to the mean of its posterior, with the standard errors of the posterior. A step is not taken if
+    it leads farther from the mean, as seen from where it ends, or if instants for validation are farther off then: the
+    errors of a simulation are known less well than those of an observation. Raises NonFiniteError if ``fitted`` cannot
+    be linearised."""
     here = _hypothesis(forward_model, fitted)
     for _ in range(STEPS):
         if here.distance_from_mean <= CLOSE:
@@ -29,7 +30,7 @@ def posterior_fit(forward_model: ForwardModel, fitted: ModelFit, robust_scale: f
             there = _hypothesis(forward_model, _moved(forward_model, here, robust_scale))
         except NonFiniteError:
             break
-        if there.distance_from_mean >= here.distance_from_mean:
+        if there.distance_from_mean >= here.distance_from_mean or _validation(there) > _validation(here):
             break
         here = there
     return here.with_posterior()
@@ -37,6 +38,11 @@ def posterior_fit(forward_model: ForwardModel, fitted: ModelFit, robust_scale: f
 
 def _hypothesis(forward_model: ForwardModel, fitted: ModelFit) -> Hypothesis:
     return weighed(forward_model, [fitted], [linearized(forward_model, fitted)])[0]
+
+
+def _validation(hypothesis: Hypothesis) -> float:
+    """[mm]; 0 without instants for validation."""
+    return hypothesis.fitted.validation_mm or 0.0
 
 
 def _moved(forward_model: ForwardModel, here: Hypothesis, robust_scale: float) -> ModelFit:
