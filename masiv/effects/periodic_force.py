@@ -10,7 +10,7 @@ from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.effect import NodalEffect
 from masiv.effects.search_hints import SearchHints
 
-GUESSES = 5
+GUESSES = 3
 
 
 @ti.func

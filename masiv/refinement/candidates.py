@@ -18,6 +18,7 @@ from masiv.inference.model_fit import ModelFit
 from masiv.inference.robust import soft_l1_mean_square, soft_l1_weight
 from masiv.models.base import EffectTerm, ForwardModel
 from masiv.models.parameters import Parameter
+from masiv.refinement.spectrum import spectral_guesses
 
 EXPLAINED_TIE_TOL = 0.02
 """Difference of explained shares below which two guesses explain the same."""
@@ -111,7 +112,7 @@ class ScoreTest:
     def candidate(self, term: EffectTerm, *, finite: bool) -> Candidate:
         """The best of the guesses of ``term``. Raises NonFiniteError if the rollouts of all diverge."""
         tried, failed = [], None
-        for guess in term.guesses:
+        for guess in self._guesses(term):
             for size in SECANT_STEPS if term.nonsmooth and not finite else SECANT_STEPS[:1]:
                 try:
                     if finite:
@@ -125,6 +126,14 @@ class ScoreTest:
         if not tried:
             raise failed or NonFiniteError(0, 0, "no direction in which its strengths would act is known")
         return _smallest(tried, term)
+
+    def _guesses(self, term: EffectTerm) -> Sequence[tuple[float, ...]]:
+        """Those of ``term``, and for a frequency those at which the residual oscillates."""
+        if [term.units[p.name] for p in term.others] != ["Hz"]:
+            return term.guesses
+        (p,) = term.others
+        peaks = spectral_guesses(self.forward_model.observations, self.base.fields)
+        return [*term.guesses, *((f,) for f in peaks if p.lower <= f <= p.upper)]
 
     def linear(self, term: EffectTerm, guess: tuple[float, ...], size: float) -> Candidate:
         """The effect with its places, frequencies… at ``guess``, linear from zero to ``size`` steps of its strengths.
