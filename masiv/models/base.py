@@ -160,6 +160,10 @@ class ForwardModel(ABC):
         """Axes in which effects act in recording ``index``: those of the world, unless a subclass has others."""
         return SimulationFrame(np.eye(3), np.zeros(3))
 
+    def effect_gravity(self, index: int) -> np.ndarray | None:
+        """Gravity (3,) [m/s^2] in ``effect_axes``; None if it is not known."""
+        return None
+
     def nuisance(self, model: Model, values: Mapping[str, float], index: int) -> np.ndarray:
         """Derivatives (T, N, A, Q) of recording ``index`` by what is fitted to it alone for each model, such as the
         start of a held-out flight. Q is 0 if there is nothing of the kind."""

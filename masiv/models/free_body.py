@@ -106,6 +106,10 @@ class FreeBodyModel(ForwardModel):
         apart = (*model.effects, *(n for n, e in library.items() if e.hints.needs_clamp))
         return [n for n, e in library.items() if n not in apart and not (taken and isinstance(e, ContactEffect))]
 
+    def effect_gravity(self, index: int) -> np.ndarray:
+        """See ``ForwardModel``."""
+        return self.setups[index].body.body.gravity
+
     def term(self, name: str) -> EffectTerm:
         """The effect on everything; its guesses are from the fitted frames of the first recording."""
         term = plain_term(name, self.setups[0].body.context(self.observations[0].fit_frames))

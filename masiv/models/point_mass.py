@@ -142,6 +142,10 @@ class PointMassModel(ForwardModel):
         """See ``ForwardModel``."""
         return self.frame
 
+    def effect_gravity(self, index: int) -> np.ndarray:
+        """See ``ForwardModel``."""
+        return self.gravity
+
     def parameters_of(self, term: EffectTerm, body: str) -> tuple[Parameter, ...]:
         """The parameters of ``term`` for one of its bodies."""
         return tuple(p for p in term.parameters if " of " not in p.name or p.name.endswith(f" of {body}"))

@@ -23,6 +23,7 @@ from masiv.refinement.discrepancy_field import peak, sampled_fields, share
 from masiv.refinement.limits import UpperLimit
 from masiv.refinement.result import ADDED, NOTHING, RANKED, BodyResult, Proposal, RefineResult, SharedFit
 from masiv.refinement.rounds import Round, Trial, alternatives
+from masiv.refinement.support import carried_weight, question
 from masiv.refinement.world_vectors import vectors_in_world
 
 SCHEMA = 4
@@ -162,12 +163,15 @@ def _parameters(term: EffectTerm, fitted: ModelFit) -> dict[str, Any]:
 
 def _accepted(result: RefineResult, term: EffectTerm, fitted: ModelFit) -> dict[str, Any]:
     place = result.places.get(term.name)
+    shown = _parameters(term, fitted)
+    carried = carried_weight(term.effect, shown["theta"], result.forward_model.effect_gravity(0))
     others = alternatives(term.name, fitted, result.search.rounds)
     return {
         "effect": term.effect,
         "scope": scope_of(term),
         "bodies": list(term.bodies),
-        **_parameters(term, fitted),
+        **shown,
+        "carried_weight": carried,
         "world": vectors_in_world(term, fitted.values, fitted.stderr, result.forward_model.effect_axes(0)),
         "indistinguishable_from": list(others),
         "alternatives": others,
@@ -372,6 +376,8 @@ def text(document: Mapping[str, Any]) -> str:
             for name, q in a["world"].items()
             if q["unit"] != "1"
         ]
+        if a["carried_weight"] is not None:
+            lines.append(f"  {question(a['carried_weight'])}")
     lines.append(f"before {_parts_mm(before)}; after {_parts_mm(after)}")
     force = shown["discrepancy_force"]
     if force is not None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from masiv.errors import InputError
 from masiv.refinement.answer import answer, outcome, words
+from masiv.refinement.support import question
 from masiv.report import plots
 from masiv.report.force_plot import force_in_time_and_space
 from masiv.report.page import Page, Share, number
@@ -269,6 +270,9 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
         ],
     )
     page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
+    for a in accepted:
+        if a.get("carried_weight") is not None:
+            page.note(f"{_name(a)}: {question(a['carried_weight'])}")
     rows = [
         [_name(a), words(n), q["value"], q["stderr"], _unit(q["unit"])]
         for a in accepted
