@@ -129,7 +129,7 @@ class ScoreTest:
 
     def _guesses(self, term: EffectTerm) -> Sequence[tuple[float, ...]]:
         """Those of ``term``, and for a frequency those at which the residual oscillates."""
-        if [term.units[p.name] for p in term.others] != ["Hz"]:
+        if [term.units.get(p.name) for p in term.others] != ["Hz"]:
             return term.guesses
         (p,) = term.others
         peaks = spectral_guesses(self.forward_model.observations, self.base.fields)
