@@ -7,50 +7,80 @@ not linear.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
+import numpy as np
+
 from masiv.errors import NonFiniteError
+from masiv.inference.error_model import ErrorModel
+from masiv.inference.evidence import Evidence
 from masiv.inference.model_fit import ModelFit, evaluate_fit
 from masiv.models.base import ForwardModel
-from masiv.refinement.hypotheses import Hypothesis, linearized, weighed
+from masiv.refinement.hypotheses import Hypothesis, linearized
 
 STEPS = 3
+PROBABLE = 0.5
+"""Probability of something unknown above which the errors of a model are not those that were expected."""
 CLOSE = 0.1
 """Distance from the posterior mean, in its standard deviations, that is no longer worth a step."""
 
 
 def posterior_fit(forward_model: ForwardModel, fitted: ModelFit, robust_scale: float) -> ModelFit:
-    """``fitted`` moved to the mean of its posterior, with the standard errors of the posterior. A step is not taken if
-    it leads farther from the mean, as seen from where it ends, or if instants for validation are farther off then: the
+    """``fitted`` moved to the mean of its posterior, with the standard errors of the posterior. It stays if something
+    unknown probably acts: errors as large as the motion tell next to nothing of it. A step is not taken if it makes
+    the residual less probable, as the model is not linear, or if instants for validation are farther off then: the
     errors of a simulation are known less well than those of an observation. Raises NonFiniteError if ``fitted`` cannot
     be linearised."""
-    here = _hypothesis(forward_model, fitted)
+    here = _Point.of(forward_model, fitted)
     for _ in range(STEPS):
-        if here.distance_from_mean <= CLOSE:
+        if here.hypothesis.distance_from_mean <= CLOSE or here.hypothesis.marginal.unknown > PROBABLE:
             break
         try:
-            there = _hypothesis(forward_model, _moved(forward_model, here, robust_scale))
+            moved = here.moved(forward_model, robust_scale)
+            if here.log_density(moved) <= here.log_density(here.hypothesis.fitted) or _worse(moved, fitted):
+                break
+            here = _Point.of(forward_model, moved)
         except NonFiniteError:
             break
-        if there.distance_from_mean >= here.distance_from_mean or _validation(there) > _validation(here):
-            break
-        here = there
-    return here.with_posterior()
+    return here.hypothesis.with_posterior()
 
 
-def _hypothesis(forward_model: ForwardModel, fitted: ModelFit) -> Hypothesis:
-    return weighed(forward_model, [fitted], [linearized(forward_model, fitted)])[0]
+def _worse(moved: ModelFit, fitted: ModelFit) -> bool:
+    """Whether instants for validation are farther off; False if there are none."""
+    return (moved.validation_mm or 0.0) > (fitted.validation_mm or 0.0)
 
 
-def _validation(hypothesis: Hypothesis) -> float:
-    """[mm]; 0 without instants for validation."""
-    return hypothesis.fitted.validation_mm or 0.0
+@dataclass(frozen=True)
+class _Point:
+    """A fit with its evidence, linearised."""
 
+    evidence: Evidence
+    hypothesis: Hypothesis
 
-def _moved(forward_model: ForwardModel, here: Hypothesis, robust_scale: float) -> ModelFit:
-    """The fit at the mean of the posterior, within the bounds of its parameters."""
-    fitted, values = here.fitted, dict(here.fitted.values)
-    for p, change in zip(here.linear.parameters, here.marginal.mean, strict=False):
-        if p.name in values:
-            values[p.name] = p.value(p.fitted(values[p.name]) + float(change))
-    return evaluate_fit(
-        forward_model, fitted.model, fitted.parameters, values, fitted.jacobian, robust_scale=robust_scale
-    )
+    @classmethod
+    def of(cls, forward_model: ForwardModel, fitted: ModelFit) -> _Point:
+        """Raises NonFiniteError."""
+        line = linearized(forward_model, fitted)
+        evidence = Evidence.of(forward_model.observations, line.fields)
+        terms = [forward_model.term(n) for n in fitted.model.effects]
+        return cls(evidence, Hypothesis(fitted, line, evidence.marginal(line, terms)))
+
+    def moved(self, forward_model: ForwardModel, robust_scale: float) -> ModelFit:
+        """The fit at the mean of the posterior, within the bounds of its parameters. Raises NonFiniteError."""
+        fitted, values = self.hypothesis.fitted, dict(self.hypothesis.fitted.values)
+        for p, change in zip(self.hypothesis.linear.parameters, self.hypothesis.marginal.mean, strict=False):
+            if p.name in values:
+                values[p.name] = p.value(p.fitted(values[p.name]) + float(change))
+        return evaluate_fit(
+            forward_model, fitted.model, fitted.parameters, values, fitted.jacobian, robust_scale=robust_scale
+        )
+
+    def log_density(self, fitted: ModelFit) -> float:
+        """Of the residual of ``fitted`` under the errors of this point; what is no value of a fit, such as the start of
+        a held-out flight, is at the mean of the posterior."""
+        line, marginal = self.hypothesis.linear, self.hypothesis.marginal
+        free = np.ones(len(marginal.mean), dtype=bool)
+        free[[k for k, p in enumerate(line.parameters) if p.name in self.hypothesis.fitted.values]] = False
+        blocks = self.evidence.blocks(replace(line, fields=list(fitted.fields)))
+        model = ErrorModel(tuple(blocks), marginal.logs)
+        return model.logpdf([b.residual + b.jacobian @ (marginal.mean * free) for b in blocks])

@@ -316,8 +316,8 @@ def refined(found: dict[str, Any]) -> Numbers:
         "laws": [found["laws"]["before"], found["laws"]["after"]],
         "law": parameters(found["law_parameters"]) if of_tracks else {},
         "noise_mm": found["noise_floor_mm"],
-        "grid_mm": [found["discretization_mm"]["fit"], found["discretization_mm"]["held_out"]],
-        "residual_mm": [found["residual_mm"]["fit"], found["residual_mm"]["held_out"]],
+        "grid_mm": [found["discretization_mm"]["fit"], found["discretization_mm"]["validation"]],
+        "residual_mm": [found["residual_mm"]["fit"], found["residual_mm"]["validation"]],
         "residual_over_sigma": [found["reduced_chi"]["before"], found["reduced_chi"]["after"]],
         "ranking": [
             {
@@ -361,7 +361,8 @@ def refined(found: dict[str, Any]) -> Numbers:
         **{
             when: {
                 span: {own: found[when][span][key] for own, key in errors.items() if key in found[when][span]}
-                for span in ("fit", "held_out")
+                for span in ("fit", "validation", "test")
+                if span in found[when]
             }
             for when in ("before", "after")
         },
