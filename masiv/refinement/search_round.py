@@ -245,8 +245,10 @@ def _refit_unconverged(
     state: SearchState, trials: Sequence[Trial], bases: Sequence[ModelFit], settings: SearchSettings
 ) -> list[Trial]:
     """Trials, best first, of which those that have not reached what the ranking promised go on with fresh derivatives:
-    from where they ended, and from where the best with the same law did."""
-    failed = [t for t in trials if not _converged(t, bases)]
+    from where they ended, and from where the best with the same law did. Those that would not be as good as the best
+    trial if they kept their promise do not."""
+    own = {b.model.family.kind: b for b in reversed(bases)}
+    failed = [t for t in trials if not _converged(t, bases) and could_improve(t.candidate, own[t.law], trials)]
     best = {law: next(t.fitted for t in trials if t.law == law) for law in {t.law for t in trials}}
     tasks = [(t.fitted, best[t.law], state.robust_scale) for t in failed]
     again: dict[int, ModelFit] = {}
