@@ -13,7 +13,7 @@ def oracle(simulation, result, *, law: str, contact: str, parameters: Mapping[st
     starts = [result.before] if result.after is result.before else [result.before, result.after]
     try:
         # Its own substeps: those that the search settled on may be too long for the true stiffness.
-        best = fit_true_model(type(simulation)(simulation.observations), starts, law, contact, parameters, effects)
+        best = fit_true_model(type(simulation)(simulation.setups), starts, law, contact, parameters, effects)
     except MasivError as failed:
         return {"problem": str(failed)}
     found = {n: v for n, v in best.values.items() if "@" not in n}

@@ -53,8 +53,10 @@ class ActiveEffects:
 
     @property
     def kernel_members(self) -> list[tuple[NodalEffect | ContactEffect | StressEffect, torch.Tensor]]:
-        """Those with Taichi functions: the nodes' effects, then the contact's, then those on the stress."""
-        return [*self.of_kind(NodalEffect), *self.of_kind(ContactEffect), *self.of_kind(StressEffect)]
+        """Those with Taichi functions: the nodes' effects, then the contact's, then those on the stress. Of one kind, by
+        name, and last what has no strength, a boundary condition: the order of members changes nothing."""
+        kinds = (NodalEffect, ContactEffect, StressEffect)
+        return [m for kind in kinds for m in sorted(self.of_kind(kind), key=lambda m: (not m[0].strengths, m[0].name))]
 
     def coefficients(self) -> list[torch.Tensor]:
         """Coefficients of ``kernel_members``, differentiable: (K,) for one on the grid, (N, K) on the stress."""

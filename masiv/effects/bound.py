@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import ContactEffect, NodalEffect, StressEffect
+from masiv.effects.catalogue import causes
+from masiv.effects.context import EffectContext
+from masiv.effects.effect import ContactEffect, Effect, NodalEffect, StressEffect
 
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
     from masiv.materials.law import BoundLaw
+
+KernelEffect = NodalEffect | ContactEffect | StressEffect
 
 
 class BoundEffects:
@@ -19,40 +24,97 @@ class BoundEffects:
 
     Inputs of the rollout that effects give, differentiable: coefficients, one tensor for each of
     ``ActiveEffects.kernel_members``; force (N, 3) [N] on the particles, None if there is none; mass_factor (N,), None
-    if masses are as they are.
+    if masses are as they are. forward: ``ForwardEffects``, or ``NoEffects`` if nothing acts in a substep.
     """
 
     def __init__(self, effects: ActiveEffects | None, mpm: MpmKernels, count: int) -> None:
         self.mpm = mpm
         self.count = count
-        members = effects.kernel_members if effects else []
+        self.members: list[KernelEffect] = [e for e, _ in effects.kernel_members] if effects else []
         self.coefficients = effects.coefficients() if effects else []
         self.force = effects.force() if effects else None
         self.mass_factor = effects.mass_factor() if effects else None
         self._values = [c.detach().to(mpm.torch_dtype).contiguous() for c in self.coefficients]
-        self._kernels = [_kernels(mpm, e, c.shape[-1]) for (e, _), c in zip(members, self.coefficients, strict=True)]
-        by_kind = list(zip(self._kernels, (e for e, _ in members), strict=True))
+        self._force_values = None if self.force is None else self.force.detach().to(mpm.torch_dtype).contiguous()
+        self.on_grid = any(not isinstance(e, StressEffect) for e in self.members)
+        self.on_stress = any(isinstance(e, StressEffect) for e in self.members)
+        self.empty = not self.members and self.force is None
+        self._known: list[KernelEffect] = []
+        if effects is None or self.empty:
+            from masiv.kernels.forward_effects import NoEffects
+
+            self.forward: Any = mpm.attached(NoEffects, lambda: NoEffects(mpm))
+        else:
+            self._known = _compiled_together(self.members)
+            self.forward = _forward_effects(mpm, self._known, effects.context)
+
+    def write(self) -> None:
+        """Fill the fields of the forward substep, which rollouts of one capacity share."""
+        if not self.empty:
+            values = zip(self.members, self._values, strict=True)
+            self.forward.write({self._known.index(e): c for e, c in values}, self._force_values)
+
+    # ---- a substep in several launches -----------------------------------------------------------------------------
+
+    def p2g(self, law: BoundLaw, s: int, nodes: int) -> None:
+        """Law, effects on the stress, transfer to the grid."""
+        if not self.on_stress:
+            law.p2g(self.mpm, s, self.count, nodes)
+            return
+        law.forward(s, self.count)
+        self.forward.on_stress(s, self.count)
+        self.mpm.p2g(s, self.count, nodes)
+
+    def grid_update(self, offset: int, time: float) -> None:
+        """Sum of the chunks' grids into the log at ``offset``; velocities of the nodes: gravity, effects, contact."""
+        if self.on_grid:
+            self.forward.grid_update(offset, time)
+        else:
+            self.mpm.grid_update(offset)
+
+    def apply_forces(self, s: int) -> None:
+        """Forces on the particles at the end of substep s."""
+        if self.force is not None:
+            self.forward.on_velocities(s + 1, self.count)
+
+    # ---- its adjoint, in the reverse order -------------------------------------------------------------------------
+
+    @cached_property
+    def adjoint(self) -> BoundAdjoints:
+        """Kernels of the adjoint, with fields of their own: made if one is asked for."""
+        return BoundAdjoints(self.mpm, self.count, self.members, self._values, self._force_values)
+
+
+class BoundAdjoints:
+    """Adjoints of what the effects ``members``, with coefficients ``values``, and a ``force`` (N, 3) [N] do in a
+    substep."""
+
+    def __init__(
+        self,
+        mpm: MpmKernels,
+        count: int,
+        members: list[KernelEffect],
+        values: list[torch.Tensor],
+        force: torch.Tensor | None,
+    ) -> None:
+        self.mpm = mpm
+        self.count = count
+        self._values, self._force_values = values, force
+        self._kernels = [_kernels(mpm, e, c.shape[-1]) for e, c in zip(members, values, strict=True)]
+        by_kind = list(zip(self._kernels, members, strict=True))
         self.nodes = [k for k, e in by_kind if isinstance(e, NodalEffect)]
         self.contact = [k for k, e in by_kind if isinstance(e, ContactEffect)]
         self.stress = [k for k, e in by_kind if isinstance(e, StressEffect)]
         self.on_grid = bool(self.nodes or self.contact)
         if self.on_grid:
-            from masiv.kernels.effects import GridWithEffects, OpenGrid
+            from masiv.kernels.effects import OpenGrid
 
-            on_grid = (*self.nodes, *self.contact)
             self._grid = mpm.attached(OpenGrid, lambda: OpenGrid(mpm))
-            self._whole_grid = mpm.attached((GridWithEffects, on_grid), lambda: GridWithEffects(mpm, on_grid))
         self._force_kernels = None
-        if self.force is not None:
+        if force is not None:
             from masiv.kernels.effects import ForceKernels
 
             self._force_kernels = mpm.attached(ForceKernels, lambda: ForceKernels(mpm))
-            self._force_values = self.force.detach().to(mpm.torch_dtype).contiguous()
-
-    @property
-    def empty(self) -> bool:
-        """True if nothing acts in a substep."""
-        return not self._kernels and self._force_kernels is None
 
     def write(self) -> None:
         """Fill the fields, which rollouts of one capacity share, and set the sums of gradients to zero."""
@@ -61,30 +123,8 @@ class BoundEffects:
         if self._force_kernels is not None:
             self._force_kernels.write(self._force_values)
 
-    # ---- a substep; ``*_adjoint`` are called in the reverse order --------------------------------------------------
-
-    def p2g(self, law: BoundLaw, s: int, nodes: int) -> None:
-        """Law, effects on the stress, transfer to the grid."""
-        if not self.stress:
-            law.p2g(self.mpm, s, self.count, nodes)
-            return
-        self._stress(law, s)
-        self.mpm.p2g(s, self.count, nodes)
-
-    def grid_update(self, offset: int, time: float) -> None:
-        """Sum of the chunks' grids into the log at ``offset``; velocities of the nodes: gravity, effects, contact."""
-        if self.on_grid:
-            self._whole_grid.grid_update(offset, time)
-        else:
-            self.mpm.grid_update(offset)
-
     def apply_forces(self, s: int) -> None:
-        """Forces on the particles at the end of substep s."""
-        if self._force_kernels is not None:
-            self._force_kernels.apply(s + 1, self.count)
-
-    def apply_forces_adjoint(self, s: int) -> None:
-        """Adjoint of ``apply_forces``; the change of the state is undone."""
+        """Adjoint of forces on the particles; the change of the state is undone."""
         if self._force_kernels is not None:
             self._force_kernels.adjoint(s + 1, self.count)
 
@@ -102,7 +142,7 @@ class BoundEffects:
             if not self.contact:
                 self._grid.contact(nodes)
 
-    def grid_update_adjoint(self, offset: int, nodes: int, time: float) -> None:
+    def grid_update(self, offset: int, nodes: int, time: float) -> None:
         """What ``g2p_adjoint`` scattered -> ``grid_momentum_bar``, after ``restore_grid`` of the same substep."""
         if not self.on_grid:
             self.mpm.grid_adjoint(offset)
@@ -114,19 +154,16 @@ class BoundEffects:
             kernels.adjoint(nodes, time)
         self._grid.momentum_adjoint(offset, nodes)
 
-    def p2g_adjoint(self, law: BoundLaw, s: int) -> None:
+    def p2g(self, law: BoundLaw, s: int) -> None:
         """``grid_momentum_bar`` -> adjoints of the particles before substep s."""
         self.mpm.p2g_adjoint(s, self.count)
         if self.stress:
-            self._stress(law, s)
+            law.forward(s, self.count)
+            for kernels in self.stress:
+                kernels.apply(s, self.count)
             for kernels in reversed(self.stress):
                 kernels.adjoint(s, self.count)
         law.backward(s, self.count)
-
-    def _stress(self, law: BoundLaw, s: int) -> None:
-        law.forward(s, self.count)
-        for kernels in self.stress:
-            kernels.apply(s, self.count)
 
     # ---- gradients since ``write`` ---------------------------------------------------------------------------------
 
@@ -139,14 +176,40 @@ class BoundEffects:
 
     def force_gradient(self) -> torch.Tensor | None:
         """Adjoint (N, 3) of ``force``."""
-        if self._force_kernels is None:
+        if self._force_kernels is None or self._force_values is None:
             return None
         out = torch.empty_like(self._force_values)
         self._force_kernels.read_gradient(out)
         return out
 
 
-def _kernels(mpm: MpmKernels, effect: NodalEffect | ContactEffect | StressEffect, coefficients: int) -> Any:
+def _compiled_together(members: list[KernelEffect]) -> list[KernelEffect]:
+    """Effects of the kernel that simulates ``members``: all that a search may name, so that one kernel serves them all;
+    ``members`` alone if others are among them. In the order of ``ForwardEffects``, in which ``members`` are."""
+    kinds = (NodalEffect, ContactEffect, StressEffect)
+    library = [e for kind in kinds for e in causes().values() if isinstance(e, kind)]
+    return library if all(e in library for e in members) else members
+
+
+def _forward_effects(mpm: MpmKernels, effects: list[KernelEffect], context: EffectContext) -> Any:
+    from masiv.kernels.forward_effects import ForwardEffects
+
+    def make() -> Any:
+        nodal = [(e.node_velocity(), _size(e, context)) for e in effects if isinstance(e, NodalEffect)]
+        contact = [(e.contact_velocity(), _size(e, context)) for e in effects if isinstance(e, ContactEffect)]
+        stress = [(e.particle_stress(), _size(e, context)) for e in effects if isinstance(e, StressEffect)]
+        return ForwardEffects(mpm, nodal, contact, stress)
+
+    return mpm.attached((ForwardEffects, tuple(effects)), make)
+
+
+def _size(effect: KernelEffect, context: EffectContext) -> int:
+    """Coefficients of its Taichi function."""
+    start = torch.tensor([p.start for p in effect.parameters], dtype=context.rest.dtype)
+    return effect.coefficients(start, context).shape[-1]
+
+
+def _kernels(mpm: MpmKernels, effect: Effect, coefficients: int) -> Any:
     from masiv.kernels.effects import NodeKernels, StressKernels
 
     def make() -> Any:
@@ -154,6 +217,7 @@ def _kernels(mpm: MpmKernels, effect: NodalEffect | ContactEffect | StressEffect
             return StressKernels(mpm, effect.particle_stress(), coefficients)
         if isinstance(effect, NodalEffect):
             return NodeKernels(mpm, effect.node_velocity(), coefficients, grounded=False)
+        assert isinstance(effect, ContactEffect)
         return NodeKernels(mpm, effect.contact_velocity(), coefficients, grounded=True)
 
     return mpm.attached((effect, coefficients), make)

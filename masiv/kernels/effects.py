@@ -1,4 +1,5 @@
-"""Kernels that apply an effect to the grid or to the stress, and their adjoints by Taichi's autodiff.
+"""Kernels of an effect on the grid, on the stress or on the particles, for the adjoint of a substep; the pointwise part
+of the adjoint is by Taichi's autodiff. The forward substep has kernels of its own: ``masiv.kernels.forward_effects``.
 
 An effect's function is pointwise: a node's or a particle's. Its coefficients are copied to every node or particle, so
 that no two of them add to the same gradient.
@@ -163,54 +164,8 @@ class NodeKernels:
 
 
 @ti.data_oriented
-class GridWithEffects:
-    """``grid_update`` with effects between gravity and contact, in one pass over the nodes that have mass: all that a
-    forward rollout needs. members: of ``NodeKernels``, that of the ground (one at most) last."""
-
-    def __init__(self, mpm, members):
-        self.mpm = mpm
-        self.functions = [m.function for m in members]
-        self.coefficients = [m.coefficients for m in members]
-        self.on_nodes = sum(not m.grounded for m in members)
-        self.on_ground = len(members) > self.on_nodes
-
-    @ti.func
-    def row_update(self, row: ti.i32, offset: ti.i32, t: ti.f64):
-        nz = self.mpm.window_shape[None][2]
-        dt, dx, now = self.mpm.constants[DT], self.mpm.constants[DX], ti.cast(t, self.mpm.real)
-        grounded = self.mpm.contact[None] != NO_GROUND and self.mpm.node_height(row) <= 0
-        for n in range(row * nz, (row + 1) * nz):
-            value = self.mpm.sum_of_chunks(n)
-            self.mpm.grid_momentum[offset + n] = value
-            v = ti.Vector.zero(self.mpm.real, 3)
-            if value[3] > 0.0:
-                v = momentum_of(value) / value[3] + dt * self.mpm.gravity()
-                x = self.mpm.node_position(n)
-                for e in ti.static(range(self.on_nodes)):
-                    v = self.functions[e](x, v, now, dt, dx, self.coefficients[e][0])
-                if grounded:
-                    held = self.mpm.contact_velocity(v)
-                    if ti.static(self.on_ground):
-                        held = self.functions[-1](x, v, held, now, dt, dx, self.coefficients[-1][0])
-                    v = held
-            self.mpm.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
-
-    @ti.kernel
-    def grid_update(self, offset: ti.i32, t: ti.f64):
-        if ti.static(self.mpm.gpu):
-            for row in range(self.mpm.rows()):
-                self.row_update(row, offset, t)
-        else:
-            ti.loop_config(block_dim=1)
-            for part in range(self.mpm.chunks):
-                rows = self.mpm.rows()
-                for row in range(part * rows // self.mpm.chunks, (part + 1) * rows // self.mpm.chunks):
-                    self.row_update(row, offset, t)
-
-
-@ti.data_oriented
 class ForceKernels:
-    """A constant force (N, 3) [N] on the particles: v += dt f / m at the end of each substep."""
+    """The adjoint of a constant force (N, 3) [N] on the particles: v += dt f / m at the end of each substep."""
 
     def __init__(self, mpm):
         self.mpm = mpm
@@ -230,12 +185,6 @@ class ForceKernels:
         for p in range(out.shape[0]):
             for i in ti.static(range(3)):
                 out[p, i] = self.total[p][i]
-
-    @ti.kernel
-    def apply(self, s: ti.i32, count: ti.i32):
-        """Of the velocities at the start of substep s, which G2P of the one before has written."""
-        for p in range(count):
-            self.mpm.velocity[s, p] += (self.mpm.constants[DT] / self.mpm.particle_mass[p]) * self.force[p]
 
     @ti.kernel
     def adjoint(self, s: ti.i32, count: ti.i32):

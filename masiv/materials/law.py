@@ -33,8 +33,9 @@ class BoundLaw(ABC):
         self.forward(s, count)
         mpm.p2g(s, count, nodes)
 
-    def substeps(self, mpm: MpmKernels, serial: bool) -> SubstepKernels | None:
-        """Kernels of whole substeps with this law, ready to be launched; None if it has none, and on a GPU."""
+    def substeps(self, mpm: MpmKernels, effects: Any, serial: bool) -> SubstepKernels | None:
+        """Kernels of whole substeps with this law and ``effects`` (``NoEffects`` or ``ForwardEffects``), ready to be
+        launched; None if it has none, and on a GPU."""
         return None
 
     @abstractmethod
@@ -65,19 +66,22 @@ class SharedBoundLaw(BoundLaw):
         self.kernels.forward(s, count)
 
     def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
-        whole = self.substeps(mpm, True)
+        from masiv.kernels.forward_effects import NoEffects
+
+        whole = self.substeps(mpm, mpm.attached(NoEffects, lambda: NoEffects(mpm)), True)
         if whole is None:
             super().p2g(mpm, s, count, nodes)
         else:
             whole.transfer(s, count, nodes)
 
-    def substeps(self, mpm: MpmKernels, serial: bool) -> SubstepKernels | None:
+    def substeps(self, mpm: MpmKernels, effects: Any, serial: bool) -> SubstepKernels | None:
         if mpm.gpu:
             return None
         self._own()
         from masiv.kernels.substep import SubstepKernels
 
-        return mpm.attached((SubstepKernels, self.kernels, serial), lambda: SubstepKernels(mpm, self.kernels, serial))
+        key = (SubstepKernels, self.kernels, effects, serial)
+        return mpm.attached(key, lambda: SubstepKernels(mpm, self.kernels, effects, serial))
 
     def backward(self, s: int, count: int) -> None:
         self._own()

@@ -147,11 +147,14 @@ class TapedRollout:
 
     def _substeps(self, segment: Segment, begin: int, end: int, nodes: int) -> None:
         serial = self.count <= SERIAL_PARTICLES  # for any number of threads: the two kernels round differently
-        whole = self.bound.substeps(self.kernels, serial) if self.effects.empty else None
+        # With several threads a launch is for one substep: three with effects are not worth a kernel of all of it.
+        fused = serial or self.effects.empty
+        whole = self.bound.substeps(self.kernels, self.effects.forward, serial) if fused else None
         if whole is not None:
             at_once = end - begin if serial else 1
             for s in range(begin, end, at_once):
-                whole.advance(s, s + at_once, self.count, nodes, self.tape.log_entry(s, nodes))
+                log = self.tape.log_entry(s, nodes)
+                whole.advance(s, s + at_once, self.count, nodes, log, self._time(segment, s))
             return
         for s in range(begin, end):
             self._substep(s, self._time(segment, s), nodes)
@@ -171,18 +174,19 @@ class TapedRollout:
 
     def _substep_adjoint(self, s: int, time: float, nodes: int) -> None:
         """The adjoint of the state at local substep s + 1 -> that at s, in the fields ``*_bar``."""
-        offset = self.tape.log_offset(s, nodes)
-        self.effects.restore_grid(s, offset, nodes, time)
-        self.effects.apply_forces_adjoint(s)
+        offset, adjoint = self.tape.log_offset(s, nodes), self.effects.adjoint
+        adjoint.restore_grid(s, offset, nodes, time)
+        adjoint.apply_forces(s)
         self.kernels.g2p_adjoint(s, self.count, nodes)
-        self.effects.grid_update_adjoint(offset, nodes, time)
-        self.effects.p2g_adjoint(self.bound, s)
+        adjoint.grid_update(offset, nodes, time)
+        adjoint.p2g(self.bound, s)
 
     # ---- backward --------------------------------------------------------------------------------------------------
 
     def backward(self, positions_bar: torch.Tensor) -> Adjoint:
         """Adjoints of the inputs from that of ``positions``, (K, N, 3)."""
         self._write_constants()
+        self.effects.adjoint.write()
         self.kernels.clear_bars(self.count)
         bars = positions_bar.detach().to(self.dtype).contiguous()
         for segment in reversed(self.tape.segments):
@@ -210,7 +214,10 @@ class TapedRollout:
         self.kernels.read_bars(*state.tensors())
         mass = torch.empty(self.count, dtype=self.dtype)
         self.kernels.read_mass_bar(mass)
-        force = self.effects.force_gradient()
+        adjoint = self.effects.adjoint
+        force = adjoint.force_gradient()
         if force is not None:
             self.kernels.owner = None  # their adjoint undoes the states
-        return Adjoint(state, self.bound.parameter_gradients(), self.effects.coefficient_gradients(), mass, force)
+        return Adjoint(
+            state, self.bound.parameter_gradients(), self.effects.adjoint.coefficient_gradients(), mass, force
+        )

@@ -1,0 +1,152 @@
+"""Effects in a forward substep: switched on and off when it runs, so that one kernel serves every set of them."""
+
+import taichi as ti
+
+from masiv.kernels.grid import DT, DX, NO_GROUND, momentum_of
+
+
+@ti.data_oriented
+class NoEffects:
+    """The interface of ``ForwardEffects`` where nothing acts."""
+
+    def __init__(self, mpm):
+        self.mpm = mpm
+
+    @ti.func
+    def row_update(self, row: ti.i32, offset: ti.i32, t: ti.f64):
+        self.mpm.row_update(row, offset)
+
+    @ti.func
+    def on_stress_of(self, s: ti.i32, p: ti.i32):
+        pass
+
+    @ti.func
+    def on_velocity_of(self, s: ti.i32, p: ti.i32):
+        pass
+
+
+@ti.data_oriented
+class ForwardEffects:
+    """Functions of effects (``masiv.effects.effect``), each with its number of coefficients: on the nodes, on the nodes
+    on or below the ground (of which one at most acts), on the stress; and forces on the particles.
+
+    They act in this order. ``acting``: bit e is set if function e acts, the bit after the last if forces do.
+    """
+
+    def __init__(self, mpm, on_nodes, on_ground, on_stress):
+        self.mpm = mpm
+        self.functions = [f for f, _ in (*on_nodes, *on_ground, *on_stress)]
+        self.sizes = [n for _, n in (*on_nodes, *on_ground, *on_stress)]
+        self.nodal, self.grid = len(on_nodes), len(on_nodes) + len(on_ground)
+        self.all = len(self.functions)
+        assert self.all < 31, "bits of acting"
+        self.starts = [sum(self.sizes[:e]) for e in range(self.grid)]
+        self.values = ti.field(mpm.real, shape=max(sum(self.sizes[: self.grid]), 1))
+        capacity = mpm.capacity_particles
+        self.of_particles = [ti.Vector.field(n, mpm.real, shape=capacity) for n in self.sizes[self.grid :]]
+        self.force = ti.Vector.field(3, mpm.real, shape=capacity)
+        self.acting = ti.field(ti.i32, shape=())
+
+    # ---- coefficients ------------------------------------------------------------------------------------------------
+
+    def write(self, values, force) -> None:
+        """values: by index of the function, coefficients of those that act: (K,), of those on the stress (N, K); force
+        (N, 3) [N], None if none acts."""
+        self.acting[None] = sum(1 << e for e in values) + (0 if force is None else 1 << self.all)
+        for e, c in values.items():
+            if e < self.grid:
+                self.write_values(self.starts[e], c)
+            else:
+                self.write_of_particles(e - self.grid, c)
+        if force is not None:
+            self.write_force(force)
+
+    @ti.kernel
+    def write_values(self, start: ti.i32, values: ti.types.ndarray()):
+        for i in range(values.shape[0]):
+            self.values[start + i] = values[i]
+
+    @ti.kernel
+    def write_of_particles(self, which: ti.template(), values: ti.types.ndarray()):
+        for p in range(values.shape[0]):
+            for i in ti.static(range(self.sizes[self.grid + which])):
+                self.of_particles[which][p][i] = values[p, i]
+
+    @ti.kernel
+    def write_force(self, values: ti.types.ndarray()):
+        for p in range(values.shape[0]):
+            for i in ti.static(range(3)):
+                self.force[p][i] = values[p, i]
+
+    # ---- what acts on a row of nodes, on a particle ------------------------------------------------------------------
+
+    @ti.func
+    def coefficients(self, e: ti.template()):
+        c = ti.Vector.zero(self.mpm.real, self.sizes[e])
+        for i in ti.static(range(self.sizes[e])):
+            c[i] = self.values[self.starts[e] + i]
+        return c
+
+    @ti.func
+    def row_update(self, row: ti.i32, offset: ti.i32, t: ti.f64):
+        """``MpmKernels.row_update`` with effects between gravity and contact."""
+        nz, acting = self.mpm.window_shape[None][2], self.acting[None]
+        dt, dx, now = self.mpm.constants[DT], self.mpm.constants[DX], ti.cast(t, self.mpm.real)
+        grounded = self.mpm.contact[None] != NO_GROUND and self.mpm.node_height(row) <= 0
+        for n in range(row * nz, (row + 1) * nz):
+            value = self.mpm.sum_of_chunks(n)
+            self.mpm.grid_momentum[offset + n] = value
+            v = ti.Vector.zero(self.mpm.real, 3)
+            if value[3] > 0.0:
+                v = momentum_of(value) / value[3] + dt * self.mpm.gravity()
+                x = self.mpm.node_position(n)
+                for e in ti.static(range(self.nodal)):
+                    if acting & (1 << e):
+                        v = self.functions[e](x, v, now, dt, dx, self.coefficients(e))
+                if grounded:
+                    held = self.mpm.contact_velocity(v)
+                    after = held
+                    for e in ti.static(range(self.nodal, self.grid)):
+                        if acting & (1 << e):
+                            after = self.functions[e](x, v, held, now, dt, dx, self.coefficients(e))
+                    v = after
+            self.mpm.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
+
+    @ti.func
+    def on_stress_of(self, s: ti.i32, p: ti.i32):
+        for e in ti.static(range(self.grid, self.all)):
+            if self.acting[None] & (1 << e):
+                self.mpm.kirchhoff_stress[s, p] = self.functions[e](
+                    self.mpm.kirchhoff_stress[s, p], self.mpm.deformation_gradient[s, p],
+                    self.mpm.affine_velocity[s, p], self.of_particles[e - self.grid][p],
+                )  # fmt: skip
+
+    @ti.func
+    def on_velocity_of(self, s: ti.i32, p: ti.i32):
+        """Forces act on the velocities at the start of substep s, which G2P of the one before has written."""
+        if self.acting[None] & (1 << self.all):
+            self.mpm.velocity[s, p] += (self.mpm.constants[DT] / self.mpm.particle_mass[p]) * self.force[p]
+
+    # ---- for a substep in several launches ---------------------------------------------------------------------------
+
+    @ti.kernel
+    def grid_update(self, offset: ti.i32, t: ti.f64):
+        if ti.static(self.mpm.gpu):
+            for row in range(self.mpm.rows()):
+                self.row_update(row, offset, t)
+        else:
+            ti.loop_config(block_dim=1)
+            for part in range(self.mpm.chunks):
+                rows = self.mpm.rows()
+                for row in range(part * rows // self.mpm.chunks, (part + 1) * rows // self.mpm.chunks):
+                    self.row_update(row, offset, t)
+
+    @ti.kernel
+    def on_stress(self, s: ti.i32, count: ti.i32):
+        for p in range(count):
+            self.on_stress_of(s, p)
+
+    @ti.kernel
+    def on_velocities(self, s: ti.i32, count: ti.i32):
+        for p in range(count):
+            self.on_velocity_of(s, p)
