@@ -65,6 +65,10 @@ class Workers:
         self._pool: ProcessPoolExecutor | None = None
         self._started: set[Any] = set()
 
+    def __reduce__(self) -> tuple:
+        """A pool stays in its process: what is sent to another one works on one process there."""
+        return Workers, ()
+
     def __enter__(self) -> Workers:
         return self
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from flight import OMEGA, VELOCITY, observed, scene, small_simulation
+from linear_model import LinearModel, baseline
 from small import SMALL
 
 from masiv import runtime
@@ -21,12 +22,14 @@ from masiv.identification.classical.fit import FamilyFit
 from masiv.identification.config import IdentifyConfig
 from masiv.identification.losses.objective import Objective
 from masiv.identification.neural.starting_law import choose_starting_laws, search_cost
+from masiv.inference.model_fit import ModelResidual
 from masiv.models.base import Model
 from masiv.models.families import FAMILIES
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
 from masiv.observations.motion import SampledMotion
 from masiv.refinement.baselines import ALL_FRAMES_STAGE, baselines, differentiated
+from masiv.refinement.hypotheses import Linearizations, linearized
 from masiv.refinement.tasks import map_tasks, rank
 from masiv.workers import TaskError, Workers, process_count, unwrap
 
@@ -272,3 +275,37 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
     for a, b in zip(ranking, other, strict=True):
         assert a.theta == b.theta
         np.testing.assert_array_equal(a.columns, b.columns)
+
+
+def test_derivatives_in_two_processes_are_those_of_one(two):
+    model = LinearModel({"linear_drag": 0.3, "body_force": 0.1})
+    fit = baseline(model, ["linear_drag", "body_force"])
+    before = model.rollouts
+    alone = linearized(model, fit)
+    taken = model.rollouts - before
+    shared = linearized(model.with_workers(two), fit)
+    np.testing.assert_array_equal(shared.jacobians[0], alone.jacobians[0])
+    assert model.rollouts == before + 2 * taken
+
+
+def test_what_diverges_in_another_process_is_left_out(two):
+    model = LinearModel({}, diverges=("viscosity",))
+    residual = ModelResidual(model.with_workers(two), Model(None, "none", ("viscosity", "linear_drag")))
+    values = {"velocity_z": 0.0, "viscosity.strength": 0.0, "linear_drag.strength": 0.0}
+    found = residual.batch([{**values, f"{name}.strength": 0.1} for name in ("viscosity", "linear_drag")])
+    assert found[0] is None
+    np.testing.assert_array_equal(found[1], residual({**values, "linear_drag.strength": 0.1}))
+
+
+def test_models_are_linearised_once(two):
+    model = LinearModel({"linear_drag": 0.3})
+    fits = [baseline(model), baseline(model, ["linear_drag"])]
+    known = Linearizations(two)
+    first = known.of(model, fits[0])
+    before = model.rollouts
+    linearized(model, fits[1])
+    taken, before = model.rollouts - before, model.rollouts
+    again, other = known.each(model, fits)
+    assert again is first
+    assert list(known.each(model, fits)) == [again, other]
+    assert model.rollouts == before + taken

@@ -53,7 +53,7 @@ class ActiveEffects:
 
     @property
     def kernel_members(self) -> list[tuple[NodalEffect | ContactEffect | StressEffect, torch.Tensor]]:
-        """Those with Taichi functions: the nodes' effects, then the contact's, then those on the stress. Of one kind, by
+        """Those with Taichi functions: the nodes' effects, then the contact's, then those on the stress. Of a kind, by
         name, and last what has no strength, a boundary condition: the order of members changes nothing."""
         kinds = (NodalEffect, ContactEffect, StressEffect)
         return [m for kind in kinds for m in sorted(self.of_kind(kind), key=lambda m: (not m[0].strengths, m[0].name))]

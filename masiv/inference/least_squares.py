@@ -35,6 +35,15 @@ class HeldResidual(Protocol):
         ...
 
 
+@runtime_checkable
+class BatchResidual(Protocol):
+    """A residual that several processes can work out at several values at once."""
+
+    def batch(self, points: Sequence[dict[str, float]]) -> list[np.ndarray | None]:
+        """The residual (M,) at each of ``points``; None where the simulation diverges."""
+        ...
+
+
 FIRST_STEP = 10.0
 """Radius of the first trust region, and longest step of ``broyden``, in finite-difference steps."""
 STEP_TOLERANCE = 1e-3
@@ -72,22 +81,52 @@ def free_parameters(parameters: Sequence[Parameter], values: Mapping[str, float]
     return np.array(out, dtype=int)
 
 
-def derivative(residual: Residual, values: Mapping[str, float], here: np.ndarray, p: Parameter) -> np.ndarray:
-    """Derivative (M,) of the residual, which is ``here`` (M,) at ``values``, with respect to ``p`` in its fitted scale:
-    a finite difference within the bounds. Raises NonFiniteError if the simulation diverges on both sides."""
+def derivatives(
+    residual: Residual, values: Mapping[str, float], here: np.ndarray, parameters: Sequence[Parameter]
+) -> list[np.ndarray]:
+    """Derivatives (M,) of the residual, which is ``here`` (M,) at ``values``, with respect to ``parameters`` in their
+    fitted scales: finite differences within the bounds. Raises NonFiniteError if the simulation diverges on both sides
+    of a value."""
     near = _held_at(residual, values)
+    out: dict[str, np.ndarray] = {}
+    for side in (0, 1):
+        todo = [p for p in parameters if p.name not in out]
+        points = [_shifted(p, values, side) for p in todo]
+        for p, point, found in zip(todo, points, evaluated(near, points), strict=True):
+            actual = p.fitted(point[p.name]) - p.fitted(values[p.name])
+            if found is not None and actual != 0:
+                out[p.name] = (found - here) / actual
+    for p in parameters:
+        if p.name not in out:
+            detail = f"the simulation diverges on both sides of {p.name} = {values[p.name]:.4g}"
+            raise NonFiniteError(0, 0, detail)
+    return [out[p.name] for p in parameters]
+
+
+def _shifted(p: Parameter, values: Mapping[str, float], side: int) -> dict[str, float]:
+    """``values`` with ``p`` a finite-difference step away: upwards if the bounds allow it (side 0), the other way (side
+    1)."""
     centre = p.fitted(values[p.name])
-    sides = [1.0, -1.0] if centre + p.step <= p.fitted(p.upper) else [-1.0, 1.0]
-    for side in sides:
-        shifted = {**values, p.name: p.value(centre + side * p.step)}
-        actual = p.fitted(shifted[p.name]) - centre
-        if actual == 0:
-            continue
+    up = centre + p.step <= p.fitted(p.upper)
+    return {**values, p.name: p.value(centre + (p.step if up == (side == 0) else -p.step))}
+
+
+def derivative(residual: Residual, values: Mapping[str, float], here: np.ndarray, p: Parameter) -> np.ndarray:
+    """See ``derivatives``."""
+    return derivatives(residual, values, here, [p])[0]
+
+
+def evaluated(residual: Residual, points: Sequence[dict[str, float]]) -> list[np.ndarray | None]:
+    """The residual (M,) at each of ``points``; None where the simulation diverges."""
+    if isinstance(residual, BatchResidual):
+        return residual.batch(points)
+    out: list[np.ndarray | None] = []
+    for point in points:
         try:
-            return (near(shifted) - here) / actual
+            out.append(residual(point))
         except NonFiniteError:
-            continue
-    raise NonFiniteError(0, 0, f"the simulation diverges on both sides of {p.name} = {values[p.name]:.4g}")
+            out.append(None)
+    return out
 
 
 def _held_at(residual: Residual, values: Mapping[str, float]) -> Residual:
@@ -174,25 +213,34 @@ class _Evaluator:
         """Forward differences, backward if forward leaves the bounds or diverges; (M, P) per unit of u."""
         base = self.trial(u)
         near = _held_at(self.residual, self.values(u))
-        columns = []
+        columns: dict[int, np.ndarray] = {}
+        for again in (False, True):
+            todo = [k for k in range(len(self.parameters)) if k not in columns]
+            sides = [self.side(u, k) * (-1.0 if again else 1.0) for k in todo]
+            points = [self.shifted(u, k, side) for k, side in zip(todo, sides, strict=True)]
+            self.count += len(points)
+            for k, side, found in zip(todo, sides, evaluated(near, points), strict=True):
+                if found is not None and np.isfinite(found).all():
+                    columns[k] = (np.asarray(found, dtype=np.float64).ravel() - base) * (FIRST_STEP * side)
         for k, p in enumerate(self.parameters):
-            fitted = self.start[k] + self.scale[k] * u[k]
-            sides = [1.0, -1.0] if fitted + p.step <= p.fitted(p.upper) else [-1.0, 1.0]
-            for side in sides:
-                shifted = u.copy()
-                shifted[k] += side / FIRST_STEP
-                try:
-                    columns.append((self.call(near, shifted) - base) * (FIRST_STEP * side))
-                    break
-                except NonFiniteError:
-                    continue
-            else:
+            if k not in columns:
                 raise MasivError(
                     f"the simulation diverges on both sides of {p.name} = {self.values(u)[p.name]:.4g}: "
                     "take shorter substeps (lower simulator.courant_number)"
                 )
-        self.jacobian_at = u.copy(), np.stack(columns, axis=1)
+        self.jacobian_at = u.copy(), np.stack([columns[k] for k in range(len(columns))], axis=1)
         return self.jacobian_at[1]
+
+    def side(self, u: np.ndarray, k: int) -> float:
+        """1 if a finite-difference step up from ``u`` stays within the bounds of parameter k, else -1."""
+        p = self.parameters[k]
+        return 1.0 if self.start[k] + self.scale[k] * u[k] + p.step <= p.fitted(p.upper) else -1.0
+
+    def shifted(self, u: np.ndarray, k: int, side: float) -> dict[str, float]:
+        """Values a finite-difference step of parameter k away from ``u``."""
+        out = u.copy()
+        out[k] += side / FIRST_STEP
+        return self.values(out)
 
 
 def gauss_newton(
@@ -260,7 +308,7 @@ class Linearization:
 def linearize(residual: Residual, parameters: Sequence[Parameter], values: Mapping[str, float]) -> Linearization:
     """Residual and derivatives at ``values``. Raises NonFiniteError."""
     here = residual(dict(values))
-    columns = [derivative(residual, values, here, p) for p in parameters]
+    columns = derivatives(residual, values, here, parameters)
     return Linearization(dict(values), here, np.stack(columns, axis=1) if columns else np.zeros((len(here), 0)))
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from masiv.inference.least_squares import derivative
+from masiv.inference.least_squares import derivatives
+from masiv.inference.model_fit import ModelResidual
 from masiv.models.base import ForwardModel, Model
 from masiv.models.parameters import Parameter
 
@@ -37,13 +38,8 @@ def linear_model(
 ) -> LinearModel:
     """``model`` about ``values``: one rollout over all instants, and one a parameter. Raises NonFiniteError."""
     here = forward_model.fields(model, values, held_out=True)
-    near = forward_model.held_at(values)
-
-    def flat(values: dict[str, float]) -> np.ndarray:
-        return np.concatenate([f.ravel() for f in near.fields(model, values, held_out=True)])
-
     together = np.concatenate([f.ravel() for f in here])
-    columns = [derivative(flat, values, together, p) for p in parameters]
+    columns = derivatives(ModelResidual(forward_model, model, all_instants=True), values, together, parameters)
     joined = np.stack(columns, axis=1) if columns else np.zeros((len(together), 0))
     parts = np.split(joined, np.cumsum([f.size for f in here])[:-1])
     jacobians = [part.reshape(*f.shape, len(columns)) for part, f in zip(parts, here, strict=True)]

@@ -26,6 +26,7 @@ from masiv.inference.robust import robust_scale_of, soft_l1_mean_square, soft_l1
 from masiv.models.base import ForwardModel, Model
 from masiv.models.parameters import Parameter
 from masiv.observations.base import Observation, rms_mm
+from masiv.workers import unwrap
 
 PARTS = ("fit", "validation", "test")
 """Of the instants, see ``Observation.parts``."""
@@ -89,18 +90,52 @@ def part_mm(fields: Sequence[np.ndarray], observations: Sequence[Observation], p
 
 @dataclass(frozen=True)
 class ModelResidual:
-    """The whitened residual (M,) [m] of ``model`` as a function of its values, but for those that are ``fixed``."""
+    """The whitened residual (M,) [m] of ``model`` as a function of its values, but for those that are ``fixed``; or, if
+    ``all_instants``, its fields at all of them, not whitened."""
 
     forward_model: ForwardModel
     model: Model
     fixed: Mapping[str, float] = field(default_factory=dict)
+    all_instants: bool = False
 
     def __call__(self, values: Mapping[str, float]) -> np.ndarray:
-        return self.forward_model.residual(self.model, {**self.fixed, **values})
+        values = {**self.fixed, **values}
+        if self.all_instants:
+            fields = self.forward_model.fields(self.model, values, held_out=True)
+            return np.concatenate([f.ravel() for f in fields])
+        return self.forward_model.residual(self.model, values)
 
     def held_at(self, values: Mapping[str, float]) -> ModelResidual:
         """See ``HeldResidual``."""
         return replace(self, forward_model=self.forward_model.held_at({**self.fixed, **values}))
+
+    def batch(self, points: Sequence[dict[str, float]]) -> list[np.ndarray | None]:
+        """See ``BatchResidual``; in the processes of the forward model."""
+        workers = self.forward_model.workers
+        if workers.processes == 1:
+            return self._each(points)[0]
+        parts = [list(points[k :: workers.processes]) for k in range(min(workers.processes, len(points)))]
+        out: list[np.ndarray | None] = [None] * len(points)
+        results = workers.map(_residuals, [(part,) for part in parts], shared=(self,))
+        for k, result in enumerate(results):
+            out[k :: workers.processes], rollouts = unwrap(result)
+            if len(parts) > 1:  # else they were counted here
+                self.forward_model.rollouts += rollouts
+        return out
+
+    def _each(self, points: Sequence[dict[str, float]]) -> tuple[list[np.ndarray | None], int]:
+        """The residual at each point, and how many rollouts that took."""
+        before, out = self.forward_model.rollouts, []
+        for point in points:
+            try:
+                out.append(self(point))
+            except NonFiniteError:
+                out.append(None)
+        return out, self.forward_model.rollouts - before
+
+
+def _residuals(residual: ModelResidual, points: list[dict[str, float]]) -> tuple[list[np.ndarray | None], int]:
+    return residual._each(points)
 
 
 def residual_of(forward_model: ForwardModel, model: Model) -> Residual:

@@ -24,6 +24,7 @@ from masiv.effects.context import EffectContext
 from masiv.models.families import Family
 from masiv.models.parameters import Parameter
 from masiv.scene.transforms import SimulationFrame
+from masiv.workers import Workers
 
 Self = TypeVar("Self", bound="ForwardModel")
 
@@ -103,6 +104,8 @@ class ForwardModel(ABC):
     """
 
     observations: Sequence[Any]
+    workers: Workers = Workers()
+    """Processes for simulations that do not depend on each other, see ``with_workers``."""
 
     def __init__(self, observations: Sequence[Any]) -> None:
         """Raises ValueError if two observations have the same name: they would share parameters."""
@@ -126,6 +129,13 @@ class ForwardModel(ABC):
         caches, held substeps and the count of rollouts with this one, which keeps its own observations."""
         out = copy.copy(self)
         out.observations = tuple(observations)
+        return out
+
+    def with_workers(self: Self, workers: Workers) -> Self:
+        """A copy that takes derivatives in several processes. It shares with this one what a copy with other
+        observations does."""
+        out = copy.copy(self)
+        out.workers = workers
         return out
 
     def held_at(self: Self, values: Mapping[str, float]) -> Self:

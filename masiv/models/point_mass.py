@@ -25,6 +25,7 @@ from masiv.observations.tracks import TracksObservation
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.tracks import Tracks
 from masiv.twin.from_tracks import drag_body
+from masiv.workers import Workers
 
 RIGID = Family("rigid", (), {})
 """The law of a body that does not deform: nothing to fit."""
@@ -76,6 +77,10 @@ class PointMassModel(ForwardModel):
         self.drag_bodies = {body: drag_body(tracks, tracks.bodies[body]) for body in self.bodies}
         self.substep = substep
         self.terms: dict[str, EffectTerm] = {}
+
+    def with_workers(self, workers: Workers) -> PointMassModel:
+        """This one: a flight takes less than a message to another process."""
+        return self
 
     # -- models -------------------------------------------------------------------------------------------------
 

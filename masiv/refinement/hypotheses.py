@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,8 @@ from masiv.inference.linear_model import LinearModel, linear_model
 from masiv.inference.marginal_likelihood import Marginal
 from masiv.inference.model_fit import ModelFit
 from masiv.models.base import ForwardModel
+from masiv.refinement.tasks import map_tasks
+from masiv.workers import TaskError, Workers
 
 UNKNOWN = "something unknown"
 """Stands among effects for what no effect of the library is."""
@@ -60,13 +62,46 @@ def linearized(forward_model: ForwardModel, fitted: ModelFit) -> LinearModel:
     gravity, which is known to a part, if the model can have another one. Raises NonFiniteError."""
     model = fitted.model
     parameters = [p for p in forward_model.parameters(model) if p.name in fitted.values]
-    line = linear_model(forward_model, model, fitted.values, parameters)
     if GRAVITY_EFFECT not in forward_model.candidates(model):
-        return line
+        return linear_model(forward_model, model, fitted.values, parameters)
     term = forward_model.term(GRAVITY_EFFECT)
     values = {**fitted.values, **{p.name: 0.0 for p in term.strengths}}
-    gravity = linear_model(forward_model, model.with_effect(term.name), values, term.strengths)
-    return line.with_parameters(model, fitted.values, gravity)
+    line = linear_model(forward_model, model.with_effect(term.name), values, [*parameters, *term.strengths])
+    return replace(line, model=model, values=dict(fitted.values))
+
+
+class Linearizations:
+    """``linearized`` of several fits at once, in ``workers``; each is worked out once."""
+
+    def __init__(self, workers: Workers | None = None) -> None:
+        self.workers = workers or Workers()
+        self._known: dict[tuple, tuple[ForwardModel, LinearModel]] = {}  # the forward model keeps its id its own
+
+    def of(self, forward_model: ForwardModel, fitted: ModelFit) -> LinearModel:
+        """Raises NonFiniteError."""
+        key = _identity(forward_model, fitted)
+        if key not in self._known:
+            self._known[key] = forward_model, linearized(forward_model, fitted)
+        return self._known[key][1]
+
+    def each(self, forward_model: ForwardModel, fits: Sequence[ModelFit]) -> Iterator[LinearModel | TaskError]:
+        """Of ``fits``, in order."""
+        missing = [f for f in fits if _identity(forward_model, f) not in self._known]
+        found = map_tasks(self.workers, forward_model, linearized, [(f,) for f in missing])
+        for fit in fits:
+            key = _identity(forward_model, fit)
+            if key in self._known:
+                yield self._known[key][1]
+                continue
+            line = next(found)
+            if not isinstance(line, TaskError):
+                self._known[key] = forward_model, line
+            yield line
+
+
+def _identity(forward_model: ForwardModel, fitted: ModelFit) -> tuple:
+    model = fitted.model
+    return id(forward_model), model.family.kind, model.contact, model.effects, tuple(sorted(fitted.values.items()))
 
 
 def weighed(forward_model: ForwardModel, fits: Sequence[ModelFit], linear: Sequence[LinearModel]) -> list[Hypothesis]:

@@ -16,7 +16,7 @@ from masiv.inference.error_model import ErrorModel
 from masiv.inference.evidence import Evidence
 from masiv.inference.model_fit import ModelFit, evaluate_fit
 from masiv.models.base import ForwardModel
-from masiv.refinement.hypotheses import Hypothesis, linearized
+from masiv.refinement.hypotheses import Hypothesis, Linearizations
 
 STEPS = 3
 PROBABLE = 0.5
@@ -25,13 +25,16 @@ CLOSE = 0.1
 """Distance from the posterior mean, in its standard deviations, that is no longer worth a step."""
 
 
-def posterior_fit(forward_model: ForwardModel, fitted: ModelFit, robust_scale: float) -> ModelFit:
+def posterior_fit(
+    forward_model: ForwardModel, fitted: ModelFit, robust_scale: float, linearizations: Linearizations | None = None
+) -> ModelFit:
     """``fitted`` moved to the mean of its posterior, with the standard errors of the posterior. It stays if something
     unknown probably acts: errors as large as the motion tell next to nothing of it. A step is not taken if it makes
     the residual less probable, as the model is not linear, or if instants for validation are farther off then: the
     errors of a simulation are known less well than those of an observation. Raises NonFiniteError if ``fitted`` cannot
     be linearised."""
-    here = _Point.of(forward_model, fitted)
+    known = linearizations or Linearizations()
+    here = _Point.of(forward_model, fitted, known)
     for _ in range(STEPS):
         if here.hypothesis.distance_from_mean <= CLOSE or here.hypothesis.marginal.unknown > PROBABLE:
             break
@@ -39,7 +42,7 @@ def posterior_fit(forward_model: ForwardModel, fitted: ModelFit, robust_scale: f
             moved = here.moved(forward_model, robust_scale)
             if here.log_density(moved) <= here.log_density(here.hypothesis.fitted) or _worse(moved, fitted):
                 break
-            here = _Point.of(forward_model, moved)
+            here = _Point.of(forward_model, moved, known)
         except NonFiniteError:
             break
     return here.hypothesis.with_posterior()
@@ -58,9 +61,9 @@ class _Point:
     hypothesis: Hypothesis
 
     @classmethod
-    def of(cls, forward_model: ForwardModel, fitted: ModelFit) -> _Point:
+    def of(cls, forward_model: ForwardModel, fitted: ModelFit, linearizations: Linearizations) -> _Point:
         """Raises NonFiniteError."""
-        line = linearized(forward_model, fitted)
+        line = linearizations.of(forward_model, fitted)
         evidence = Evidence.of(forward_model.observations, line.fields)
         terms = [forward_model.term(n) for n in fitted.model.effects]
         return cls(evidence, Hypothesis(fitted, line, evidence.marginal(line, terms)))

@@ -15,14 +15,14 @@ from masiv.inference.robust import robust_scale_of
 from masiv.models.base import ForwardModel
 from masiv.refinement.discrepancy import discrepancy_force
 from masiv.refinement.effect_fit import BROYDEN_STEPS
-from masiv.refinement.hypotheses import linearized, log_prior
+from masiv.refinement.hypotheses import log_prior
 from masiv.refinement.limits import UpperLimit, sensitivity, upper_limit
 from masiv.refinement.posterior_fit import posterior_fit
 from masiv.refinement.rounds import Check, Round, SearchResult
 from masiv.refinement.search_round import run_round
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks
-from masiv.workers import TaskError
+from masiv.workers import TaskError, Workers
 
 MIN_ROBUST_SCALE = 5.0
 """Robust scale of the search over the noise of the noisiest observation, at the least: the whitened residual of an
@@ -38,20 +38,23 @@ def search_effects(
 ) -> SearchResult:
     """Add effects to the best of ``baselines`` (one a law, without effects) as long as one more is probable. Raises
     MasivError if no baseline can be simulated."""
-    start, laws = whitened_start(forward_model, baselines, settings)
+    start, laws = whitened_start(forward_model.with_workers(settings.workers), baselines, settings)
     state, rounds = _add_effects(start, laws, settings)
     before = rounds[0].base if rounds else start.fit
     if settings.rank_only:
-        return SearchResult(state.forward_model, before, before, tuple(rounds), whitened_before=start.forward_model)
-    before = posterior_fit(start.forward_model, before, start.robust_scale)
+        return SearchResult(
+            state.forward_model.with_workers(Workers()), before, before, tuple(rounds),
+            whitened_before=start.forward_model.with_workers(Workers()),
+        )  # fmt: skip
+    before = posterior_fit(start.forward_model, before, start.robust_scale, settings.linearizations)
     after, limits = _settled(state, before, rounds, settings)
     overlooked = [state.forward_model.term(name).effect for name in _overlooked(rounds, limits, settings)]
     if overlooked and len(after.model.effects) < len(before.model.effects) + settings.max_effects:
         state, more = _add_effects(state.with_fit(after), [after], settings.for_effects(overlooked))
         rounds += more
         after, limits = _settled(state, before, rounds, settings)
-    checked = {"before": _check(start, before)}
-    checked["after"] = checked["before"] if after is before else _check(state, after)
+    checked = {"before": _check(start, before, settings)}
+    checked["after"] = checked["before"] if after is before else _check(state, after, settings)
     discrepancy = None
     if settings.discrepancy_force and checked["after"].p < settings.config.min_predictive_p:
         discrepancy = discrepancy_force(state.with_fit(after), settings)
@@ -60,8 +63,8 @@ def search_effects(
         null = _with_unfitted(null, rounds, limits)
     unknown = rounds[-1].posterior.unknown() if rounds and rounds[-1].posterior else 0.0
     return SearchResult(
-        state.forward_model, before, after, tuple(rounds), null, unknown, checked, tuple(limits), discrepancy,
-        whitened_before=start.forward_model,
+        state.forward_model.with_workers(Workers()), before, after, tuple(rounds), null, unknown, checked,
+        tuple(limits), discrepancy, whitened_before=start.forward_model.with_workers(Workers()),
     )  # fmt: skip
 
 
@@ -125,7 +128,9 @@ def _settled(
 ) -> tuple[ModelFit, list[UpperLimit]]:
     """The final model with values of its posterior, ``before`` if nothing was added; and limits of all else."""
     added = len(state.fit.model.effects) > len(before.model.effects)
-    after = posterior_fit(state.forward_model, state.fit, state.robust_scale) if added else before
+    after = before
+    if added:
+        after = posterior_fit(state.forward_model, state.fit, state.robust_scale, settings.linearizations)
     return after, _upper_limits(state.with_fit(after), rounds, settings)
 
 
@@ -172,8 +177,8 @@ def _rivals(state: SearchState, done: Round) -> list[ModelFit]:
     return out[:RIVALS]
 
 
-def _check(state: SearchState, fitted: ModelFit) -> Check:
-    line = linearized(state.forward_model, fitted)
+def _check(state: SearchState, fitted: ModelFit, settings: SearchSettings) -> Check:
+    line = settings.linearizations.of(state.forward_model, fitted)
     terms = [state.forward_model.term(n) for n in fitted.model.effects]
     evidence = Evidence.of(state.forward_model.observations, line.fields)
     found = forecast(evidence, line, terms, evidence.marginal(line, terms))
@@ -185,7 +190,7 @@ def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchS
     model, fitted = state.forward_model, state.fit
     names = settings.considered(model, fitted.model)
     places = {c.effect: c.theta for c in rounds[0].candidates} if rounds else {}
-    line = linearized(model, fitted)
+    line = settings.linearizations.of(model, fitted)
     terms = [model.term(n) for n in fitted.model.effects]
     evidence = Evidence.of(model.observations, line.fields)
     here = evidence.marginal(line, terms)

@@ -19,7 +19,7 @@ from masiv.inference.model_fit import (
 from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.candidates import Candidate, Ranking
 from masiv.refinement.effect_fit import MIN_PROMISE_KEPT, fit_with_effect
-from masiv.refinement.hypotheses import Hypothesis, Posterior, linearized, weighed
+from masiv.refinement.hypotheses import Hypothesis, Posterior, weighed
 from masiv.refinement.rounds import Failure, Round, Trial, rank_trials
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks, rank
@@ -367,7 +367,7 @@ def _weighed(
     label = "refine: weigh models"
     settings.progress(label, 0, len(fits))
     kept, lines, failed = [], [], {}
-    results = map_tasks(settings.workers, state.forward_model, linearized, [(f,) for f in fits])
+    results = settings.linearizations.each(state.forward_model, fits)
     for done, (fit, line) in enumerate(zip(fits, results, strict=True)):
         settings.progress(label, done + 1, len(fits))
         if isinstance(line, TaskError):

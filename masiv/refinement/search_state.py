@@ -13,6 +13,7 @@ from masiv.inference.noise_model import NoiseModel
 from masiv.models.base import ForwardModel, Model
 from masiv.progress import Progress, silent
 from masiv.refinement.config import RefineConfig
+from masiv.refinement.hypotheses import Linearizations
 from masiv.workers import Workers
 
 
@@ -28,6 +29,7 @@ class SearchSettings:
     discrepancy_force: bool = True
     workers: Workers = field(default_factory=Workers)
     progress: Progress = silent
+    linearizations: Linearizations = field(default_factory=Linearizations)
 
     @classmethod
     def of(
@@ -37,7 +39,7 @@ class SearchSettings:
         """As ``config`` has them."""
         return cls(
             config, config.max_effects, config.shortlist, rank_only, discrepancy_force,
-            workers or Workers(), progress,
+            workers or Workers(), progress, Linearizations(workers),
         )  # fmt: skip
 
     def for_effects(self, effects: Sequence[str]) -> SearchSettings:
