@@ -192,6 +192,6 @@ def test_values_of_the_posterior_are_nearer_to_the_truth_than_those_of_least_squ
 def test_a_fit_at_the_mean_of_its_posterior_stays_there():
     model = LinearModel({"velocity_z": 0.3})
     again = posterior_fit(model, baseline(model), 1.0)
-    (hypothesis,) = weighed(model, [again], [linearized(model, again)])
+    (hypothesis,) = weighed(model, [(again, linearized(model, again))])
     assert hypothesis.distance_from_mean <= CLOSE
     assert posterior_fit(model, again, 1.0).values == again.values

@@ -160,7 +160,7 @@ def test_a_model_without_derivatives_is_listed_with_its_reason_and_not_accepted(
     assert result.accepted == ()
     written = document(result)
     (refit,) = written["rounds"][0]["refits"]
-    assert "diverges on both sides of velocity_z" in refit["not_weighed"]
+    assert "diverges on both sides of body_force.strength" in refit["not_weighed"]
     assert "not weighed: " in text(written)
 
 

@@ -14,12 +14,19 @@ from masiv.inference.marginal_likelihood import Marginal
 from masiv.inference.model_fit import ModelFit
 from masiv.models.base import ForwardModel
 from masiv.refinement.tasks import map_tasks
-from masiv.workers import TaskError, Workers
+from masiv.workers import TaskError, Workers, unwrap
 
 UNKNOWN = "something unknown"
 """Stands among effects for what no effect of the library is."""
 CREDIBLE = 0.95
 """Probability of the smallest set of answers that is reported."""
+NEGLIGIBLE = 12.0
+"""Logarithm of the odds against a model beyond which it decides nothing: with derivatives that are off by a tenth, its
+evidence is known to a few units."""
+
+
+Linearized = tuple[ModelFit, LinearModel]
+"""A fit, linearised about its values over all instants."""
 
 
 @dataclass(frozen=True)
@@ -104,14 +111,43 @@ def _identity(forward_model: ForwardModel, fitted: ModelFit) -> tuple:
     return id(forward_model), model.family.kind, model.contact, model.effects, tuple(sorted(fitted.values.items()))
 
 
-def weighed(forward_model: ForwardModel, fits: Sequence[ModelFit], linear: Sequence[LinearModel]) -> list[Hypothesis]:
-    """Hypotheses of ``fits``, with one expectation of errors: what the best of them leaves."""
-    best = min(range(len(fits)), key=lambda k: fits[k].cost)
-    evidence = Evidence.of(forward_model.observations, linear[best].fields)
-    return [
-        Hypothesis(fit, line, evidence.marginal(line, [forward_model.term(n) for n in fit.model.effects]))
-        for fit, line in zip(fits, linear, strict=True)
-    ]
+def nearly_linearized(forward_model: ForwardModel, fitted: ModelFit, base: LinearModel) -> LinearModel:
+    """``fitted`` with its own derivatives by what ``base`` lacks, a model with fewer effects and its law, and those of
+    ``base`` by all else: a few rollouts in place of one a parameter. Raises NonFiniteError."""
+    model = fitted.model
+    wanted = [p for p in forward_model.parameters(model) if p.name in fitted.values]
+    known = {p.name: j for p, j in zip(base.parameters, np.moveaxis(_joined(base), -1, 0), strict=True)}
+    own = linear_model(forward_model, model, fitted.values, [p for p in wanted if p.name not in known])
+    known |= {p.name: j for p, j in zip(own.parameters, np.moveaxis(_joined(own), -1, 0), strict=True)}
+    gravity = [p for p in base.parameters if p.name.split(".")[0] == GRAVITY_EFFECT]
+    every = (*wanted, *(p for p in gravity if GRAVITY_EFFECT in forward_model.candidates(model)))
+    joined = np.stack([known[p.name] for p in every], axis=-1)
+    parts = np.split(joined, np.cumsum([f.size for f in own.fields])[:-1])
+    jacobians = [part.reshape(*f.shape, len(every)) for part, f in zip(parts, own.fields, strict=True)]
+    return replace(own, parameters=every, jacobians=jacobians)
+
+
+def _joined(linear: LinearModel) -> np.ndarray:
+    """Derivatives (M, P) of all observations."""
+    count = len(linear.parameters)
+    return np.concatenate([j.reshape(math.prod(j.shape[:-1]), count) for j in linear.jacobians])
+
+
+def weighed(
+    forward_model: ForwardModel, fits: Sequence[Linearized], workers: Workers | None = None,
+    evidence: Evidence | None = None,
+) -> list[Hypothesis]:  # fmt: skip
+    """Hypotheses of ``fits``, with one expectation of errors: that of ``evidence``, or what the best of them leaves."""
+    evidence = evidence or evidence_of(forward_model, fits)
+    tasks = [(line, [forward_model.term(n) for n in fit.model.effects]) for fit, line in fits]
+    found = map(unwrap, (workers or Workers()).map(Evidence.marginal, tasks, shared=(evidence,)))
+    return [Hypothesis(fit, line, marginal) for (fit, line), marginal in zip(fits, found, strict=True)]
+
+
+def evidence_of(forward_model: ForwardModel, fits: Sequence[Linearized]) -> Evidence:
+    """With the errors that the best of ``fits`` leaves."""
+    _, line = min(fits, key=lambda pair: pair[0].cost)
+    return Evidence.of(forward_model.observations, line.fields)
 
 
 @dataclass(frozen=True)

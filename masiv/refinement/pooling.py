@@ -102,7 +102,7 @@ class _Pool:
             return (str(failed),)
         if why := one.impossible(fitted, own):
             return tuple(why)
-        null, effect = weighed(one, [without, fitted], [linearized(one, without), linearized(one, fitted)])
+        null, effect = weighed(one, [(f, linearized(one, f)) for f in (without, fitted)])
         p = Posterior.of([null, effect], 1).with_at_most(len(others.effects))
         if p >= self.config.max_null_probability:
             return (f"its own flights leave a probability of {p:.2g} that it does not act",)
@@ -143,6 +143,6 @@ class _Pool:
         )  # fmt: skip
         strengths = [after.values[t.parameters[0].name] for t in parts if t.bodies]
         std = float(np.std(strengths, ddof=1)) if len(strengths) > 1 else math.nan
-        each, shared = weighed(model, [after, fitted], [linearized(model, after), linearized(model, fitted)])
+        each, shared = weighed(model, [(f, linearized(model, f)) for f in (after, fitted)])
         factor = shared.marginal.log_evidence - each.marginal.log_evidence
         return SharedFit(one, shared.with_posterior(), factor, std)

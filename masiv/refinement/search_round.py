@@ -19,7 +19,15 @@ from masiv.inference.model_fit import (
 from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.candidates import Candidate, Ranking
 from masiv.refinement.effect_fit import MIN_PROMISE_KEPT, fit_with_effect
-from masiv.refinement.hypotheses import Hypothesis, Posterior, weighed
+from masiv.refinement.hypotheses import (
+    NEGLIGIBLE,
+    Hypothesis,
+    Linearized,
+    Posterior,
+    evidence_of,
+    nearly_linearized,
+    weighed,
+)
 from masiv.refinement.rounds import Failure, Round, Trial, rank_trials
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks, rank
@@ -335,7 +343,7 @@ def _judged(
     """The round with the posterior over the models without (``bases``) and with one effect more (``trials``)."""
     without = [state.fit, *bases[1:]]
     possible = [t for t in trials if not t.impossible]
-    hypotheses, failed = _weighed(state, [*without, *(t.fitted for t in possible)], settings)
+    hypotheses, failed = _weighed(state, without, [t.fitted for t in possible], settings)
     simpler = [h.marginal.log_evidence for h in hypotheses if len(h.effects) == len(state.fit.model.effects)]
     if not simpler:  # against what would an effect be probable?
         raise MasivError(f"no model without a further effect can be weighed: {failed[id(state.fit)]}")
@@ -360,22 +368,53 @@ def _judged(
 
 
 def _weighed(
-    state: SearchState, fits: Sequence[ModelFit], settings: SearchSettings
+    state: SearchState, without: Sequence[ModelFit], fits: Sequence[ModelFit], settings: SearchSettings
 ) -> tuple[list[Hypothesis], dict[int, str]]:
-    """Those of ``fits`` that have derivatives over all instants, with their evidence; of the others, by their id, why
-    not."""
-    label = "refine: weigh models"
+    """Hypotheses of ``without``, models without the effect that each of ``fits`` adds, and of ``fits``, but for those
+    that have no derivatives over all instants; of these, by their id, why not. What is improbable with the derivatives
+    of the model without the effect is not looked at more closely."""
+    model, workers = state.forward_model, settings.workers
+    bases, failed = _linearized(state, without, settings)
+    near = {id(f): next((line for other, line in bases if _extends(f, other)), None) for f in fits}
+    others, why = _linearized(state, [f for f in fits if near[id(f)] is None], settings)
+    rough = [f for f in fits if near[id(f)] is not None]
+    tasks = [(f, near[id(f)]) for f in rough]
+    lines = list(zip(rough, map_tasks(workers, model, nearly_linearized, tasks), strict=True))
+    failed |= why | {id(f): line.reason for f, line in lines if isinstance(line, TaskError)}
+    known = [*bases, *others, *((f, line) for f, line in lines if not isinstance(line, TaskError))]
+    if not known:
+        return [], failed
+    evidence = evidence_of(model, known)
+    found = weighed(model, known, workers, evidence)
+    best = max(h.marginal.log_evidence for h in found)
+    close = {
+        id(h.fitted) for h in found
+        if near.get(id(h.fitted)) is not None and h.marginal.log_evidence > best - NEGLIGIBLE
+    }  # fmt: skip
+    exact, why = _linearized(state, [f for f in rough if id(f) in close], settings)
+    kept = [h for h in found if id(h.fitted) not in close]
+    return [*kept, *weighed(model, exact, workers, evidence)], failed | why
+
+
+def _extends(fit: ModelFit, base: ModelFit) -> bool:
+    """Whether ``fit`` is ``base`` with an effect more."""
+    one, other = fit.model, base.model
+    return one.family == other.family and one.contact == other.contact and set(other.effects) < set(one.effects)
+
+
+def _linearized(
+    state: SearchState, fits: Sequence[ModelFit], settings: SearchSettings
+) -> tuple[list[Linearized], dict[int, str]]:
+    """``fits`` with their derivatives over all instants; of those that have none, by their id, why not."""
+    label, kept, failed = "refine: weigh models", [], {}
     settings.progress(label, 0, len(fits))
-    kept, lines, failed = [], [], {}
-    results = settings.linearizations.each(state.forward_model, fits)
-    for done, (fit, line) in enumerate(zip(fits, results, strict=True)):
+    for done, (fit, line) in enumerate(zip(fits, settings.linearizations.each(state.forward_model, fits), strict=True)):
         settings.progress(label, done + 1, len(fits))
         if isinstance(line, TaskError):
             failed[id(fit)] = line.reason
         else:
-            kept.append(fit)
-            lines.append(line)
-    return (weighed(state.forward_model, kept, lines) if kept else []), failed
+            kept.append((fit, line))
+    return kept, failed
 
 
 def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Trial:
@@ -386,7 +425,7 @@ def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Tr
         held=held_parameters(model, start),
     )  # fmt: skip
     best = _with_free_places(state, min(final, start, key=lambda f: f.cost))
-    hypotheses, failed = _weighed(state, [best], settings)
+    hypotheses, failed = _weighed(state, [best], [], settings)
     if not hypotheses:
         return replace(trial, fitted=best, impossible=(f"at its best fit, {failed[id(best)]}",))
     done = replace(trial, fitted=hypotheses[0].with_posterior())

@@ -10,10 +10,6 @@ from masiv.models.base import ForwardModel
 from masiv.refinement.candidates import Ranking, score
 from masiv.workers import Workers, run_task, unwrap
 
-EFFECTS_PER_TASK = 3
-"""Effects that one process ranks before it reports."""
-
-
 def map_tasks(
     workers: Workers, forward_model: ForwardModel, function: Callable, tasks: Iterable[tuple]
 ) -> Iterator[Any]:
@@ -39,21 +35,18 @@ def rank(
     robust_scale: float,
     progress: Callable[[str, int, int], None],
 ) -> Ranking:
-    """``score`` of the effects ``names``, a few in each task; ties in the order of ``names``. Raises MasivError."""
-    parts = [list(names[k : k + EFFECTS_PER_TASK]) for k in range(0, len(names), EFFECTS_PER_TASK)]
+    """``score`` of the effects ``names``, each a task; ties in the order of ``names``. Raises MasivError."""
     candidates, not_ranked = [], {}
-    done = 0
-    progress(parts[0][0] if parts else "", 0, len(names))
-    results = map_tasks(workers, forward_model, _score_part, [(base, robust_scale, part) for part in parts])
-    for part, result in zip(parts, results, strict=True):
+    progress(names[0] if names else "", 0, len(names))
+    results = map_tasks(workers, forward_model, _score_one, [(base, robust_scale, name) for name in names])
+    for done, (name, result) in enumerate(zip(names, results, strict=True)):
         ranking: Ranking = unwrap(result)
         candidates += ranking.candidates
         not_ranked |= ranking.not_ranked
-        done += len(part)
-        progress(part[-1], done, len(names))
+        progress(name, done + 1, len(names))
     place = {name: k for k, name in enumerate(names)}
     return Ranking(tuple(sorted(candidates, key=lambda c: (-c.explained, place[c.effect]))), not_ranked)
 
 
-def _score_part(forward_model: ForwardModel, base: ModelFit, robust_scale: float, names: list[str]) -> Ranking:
-    return score(forward_model, base, names, robust_scale=robust_scale)
+def _score_one(forward_model: ForwardModel, base: ModelFit, robust_scale: float, name: str) -> Ranking:
+    return score(forward_model, base, [name], robust_scale=robust_scale)
