@@ -252,8 +252,7 @@ def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_ranking_is_the_same_to_the_bit_side_by_side(two, monkeypatch):
-    monkeypatch.setattr("masiv.refinement.tasks.EFFECTS_PER_TASK", 1)
+def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
     simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
     values = {p.name: p.start for p in simulation.parameters(model)}

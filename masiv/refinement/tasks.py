@@ -10,6 +10,7 @@ from masiv.models.base import ForwardModel
 from masiv.refinement.candidates import Ranking, score
 from masiv.workers import Workers, run_task, unwrap
 
+
 def map_tasks(
     workers: Workers, forward_model: ForwardModel, function: Callable, tasks: Iterable[tuple]
 ) -> Iterator[Any]:
