@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 import json
 import os
+import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from typing import Any
@@ -15,7 +17,9 @@ import typer
 
 from masiv.errors import InputError, MasivError
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+from .supervisor import GOES_ON, Interrupted, reason
+
+FAILED, BAD_INPUT = 1, 2
 PLAIN_EVERY_S = 15.0
 
 
@@ -30,12 +34,13 @@ def command(function: Callable[..., tuple[dict[str, Any], str]]) -> Callable[...
     def wrapped(*args: Any, **kwargs: Any) -> None:
         as_json = bool(kwargs.get("as_json"))
         try:
-            with _quiet_stdout(as_json):
+            with _quiet_stdout(as_json), _one_line_warnings():
                 data, text = function(*args, **kwargs)
         except MasivError as error:
             fail(str(error), BAD_INPUT if isinstance(error, InputError) else FAILED, as_json)
-        except KeyboardInterrupt:
-            fail("interrupted; the same command goes on from the last checkpoint", INTERRUPTED, as_json)
+        except (KeyboardInterrupt, Interrupted) as error:
+            number = error.number if isinstance(error, Interrupted) else signal.SIGINT
+            fail(f"{reason(number)}; {GOES_ON}", 128 + number, as_json)
         except Exception as error:
             import traceback
 
@@ -79,6 +84,22 @@ def _quiet_stdout(quiet: bool) -> Iterator[None]:
     finally:
         os.dup2(kept, 1)
         os.close(kept)
+
+
+@contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Print what masiv warns of (a UserWarning) as one line, without the place in the code."""
+    with warnings.catch_warnings():
+        shown = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
+            if category is UserWarning:
+                print(f"warning: {message}", file=sys.stderr)
+            else:
+                shown(message, category, *place)
+
+        warnings.showwarning = show
+        yield
 
 
 @contextmanager
