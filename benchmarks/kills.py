@@ -3,9 +3,9 @@
     python benchmarks/kills.py [--minutes 10] [--seed 0] [--out FOLDER] [--scenes bar balls cube]
 
 Linux only. Scenes: two of tracks, a clamped bar and falling balls, and a filmed cube, whose fit has several processes.
-Every command of a run is killed up to ``--kills`` times, then it runs to its end. A kill: a moment, uniform over the time
-that the command takes; SIGTERM or SIGINT to the process that was started, or SIGKILL to it or to the one that computes.
-Prints a table. Exits with 1 if anything differs.
+Every command of a run is killed up to ``--kills`` times, then it runs to its end. A kill: a moment, uniform over the
+time that the command takes; SIGTERM or SIGINT to the process that was started, or SIGKILL to it or to the one that
+computes. Prints a table. Exits with 1 if anything differs.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ import yaml
 
 SCENES = Path(__file__).parents[1] / "tests" / "golden"
 MASIV = [sys.executable, "-m", "masiv.cli.supervisor"]
-SETTINGS = {
+BAR_SETTINGS = {
     "tracks": {"particles": 50, "duration": 0.1, "search_duration": 0.1, "rollouts": 4},
     "simulator": {"subparticles": 1, "chunks": 1},
     "identify": {"law": "neo_hookean"},
-    "refine": {"effects": ["viscosity", "point_mass"], "shortlist": 1, "max_effects": 1},
+    "refine": {"effects": ["viscosity"], "max_effects": 1},
 }
-"""Coarse: what is tested is that numbers are the same, not that they are good."""
+BALLS_SETTINGS = {"refine": {"effects": ["quadratic_drag", "body_force"], "max_effects": 1}}
 VIDEO_SETTINGS = {
     "simulator": {"particles_per_cell": 4.0, "subparticles": 1},
     "reconstruct": {
@@ -47,6 +47,7 @@ VIDEO_SETTINGS = {
     "trajectory": {"particle_count": 300, "fill_resolution": 24, "iterations": 20},
     "identify": {"start": "jelly", "contact": "sticky", "search_particles": 150, "iterations": 4, "processes": 2},
 }
+"""Coarse: what is tested is that numbers are the same, not that they are good."""
 CUBE = {
     "shape": {"kind": "cube", "size": 0.4, "rotation_deg": [20, 30, 0], "clearance": 0.25},
     "material": {"law": "neo_hookean", "parameters": {"youngs_modulus": 4e4, "poissons_ratio": 0.3}},
@@ -64,17 +65,16 @@ def commands(scene: str, folder: Path) -> list[list[str]]:
     run = str(folder / "run")
     settings = folder / "settings.yaml"
     folder.mkdir(parents=True, exist_ok=True)
-    settings.write_text(json.dumps(VIDEO_SETTINGS if scene == "cube" else SETTINGS))
+    settings.write_text(json.dumps({"bar": BAR_SETTINGS, "balls": BALLS_SETTINGS, "cube": VIDEO_SETTINGS}[scene]))
     if scene == "cube":
         (folder / "spec.yaml").write_text(json.dumps(CUBE))
         if not (folder / "scene").exists():
             complete(["synth", str(folder / "spec.yaml"), "--out", str(folder / "scene")])
         stages = ["reconstruct", str(folder / "scene"), "--out", run, "--config", str(settings), "--fit-frames", "5"]
         return [stages, ["trajectory", run], ["identify", *stages[1:]]]
-    if scene == "bar":
-        identify = ["identify", str(SCENES / "bar"), "--out", run, "--config", str(settings)]
-        return [identify, ["refine", run], ["refine", run, "--condition", "load"]]
-    return [["identify", str(SCENES / "balls"), "--out", run], ["refine", run, "--group"]]
+    identify = ["identify", str(SCENES / scene), "--out", run, "--config", str(settings)]
+    refine = ["refine", run]
+    return [identify, *([refine, [*refine, "--condition", "load"]] if scene == "bar" else [[*refine, "--group"]])]
 
 
 @dataclass
@@ -82,9 +82,13 @@ class Tally:
     """What was seen. slowest_s: from a signal to the end of the last process."""
 
     kills: Counter[tuple[str, str]] = field(default_factory=Counter)
-    slowest_s: Counter[str] = field(default_factory=Counter)
+    slowest_s: dict[str, float] = field(default_factory=dict)
     runs: int = 0
     wrong: list[str] = field(default_factory=list)
+
+    def blame(self, what: str) -> None:
+        print(what, file=sys.stderr)
+        self.wrong.append(what)
 
 
 def alive(tag: str) -> dict[int, int]:
@@ -142,7 +146,7 @@ def kill(scene: str, arguments: Sequence[str], after_s: float, draw: random.Rand
     seconds = time.monotonic() - began
     where = f"{' '.join(arguments)}, {number.name} to the {who} after {after_s:.2f} s"
     if left:
-        tally.wrong.append(f"{where}: {len(left)} processes left after {MAY_LIVE_S:g} s")
+        tally.blame(f"{where}: {len(left)} processes left after {MAY_LIVE_S:g} s")
         for pid in left:
             os.kill(pid, signal.SIGKILL)
     _, said = process.communicate()
@@ -151,10 +155,10 @@ def kill(scene: str, arguments: Sequence[str], after_s: float, draw: random.Rand
     if process.returncode == 0:
         return False  # it ended at that moment
     if process.returncode != expected or len(lines) != (expected > 0) or "Traceback" in said:
-        tally.wrong.append(f"{where}: exit code {process.returncode}, said {said!r}")
+        tally.blame(f"{where}: exit code {process.returncode}, said {said!r}")
     stage = f"{scene} {arguments[0]}"
     tally.kills[stage, f"{number.name}, {who}"] += 1
-    tally.slowest_s[number.name] = max(tally.slowest_s[number.name], seconds)
+    tally.slowest_s[number.name] = max(tally.slowest_s.get(number.name, 0.0), seconds)
     return True
 
 
@@ -218,7 +222,7 @@ def main() -> None:
                         break
                 complete(arguments)
             if different := differences(run, folder / scene / "whole"):
-                tally.wrong.append(f"run {tally.runs} of {scene}: {', '.join(different)}")
+                tally.blame(f"run {tally.runs} of {scene}: {', '.join(different)}")
                 shutil.copytree(run, folder / f"wrong_{tally.runs}")
             shutil.rmtree(run)
             tally.runs += 1

@@ -18,22 +18,24 @@ from masiv.parent import end_with_parent
 GRACE_S = 3
 """Time to clean up, after which the command is killed."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
-GOES_ON = "the same command goes on from the last checkpoint"
+
+
+interrupted_by: list[int] = []
+"""The signal that ends the command of this process, if there is one. Other errors after it are its consequences: an
+import that it breaks off raises an ImportError."""
 
 
 class Interrupted(BaseException):
-    """A signal asks the command to end. number: of the signal. Typer would keep a KeyboardInterrupt to itself."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
+    """A signal asks the command to end. Typer would keep a KeyboardInterrupt to itself."""
 
 
 def run() -> None:
     """The entry point of ``masiv``. Exit code of the command; 128 + the signal that ended it."""
     if not hasattr(os, "fork"):
-        _command()
-        return
+        code = _command()
+        if code:
+            _say(code - 128)
+        sys.exit(code)
     signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     watched, alive = os.pipe()
     parent = os.getpid()
@@ -42,28 +44,39 @@ def run() -> None:
         sys.exit(_supervised(child))
     os.close(alive)
     end_with_parent(parent, lambda: os.read(watched, 1))
-    _command()
+    sys.exit(_command())
 
 
-def _command() -> None:
-    """Run the command in this process."""
-    for number in SIGNALS:
-        signal.signal(number, _interrupt)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+def _command() -> int:
+    """Run the command in this process, which ends with its exit code. Returns one only if a signal interrupted it."""
     try:
+        for number in SIGNALS:
+            signal.signal(number, _interrupt)
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         from .main import run as command
 
         command()
-    except Interrupted as error:  # before or after the command itself, which says it
-        _say(error.number)
-        sys.exit(128 + error.number)
+    except BaseException:
+        if not interrupted_by:
+            raise
+        return 128 + interrupted_by[0]
+    finally:
+        _ignore_signals()
+    return 0
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    for other in SIGNALS:  # once is enough: another one must not disturb the end
-        signal.signal(other, signal.SIG_IGN)
-    raise Interrupted(number)
+    _ignore_signals()
+    interrupted_by.append(number)
+    sys.unraisablehook = lambda _: None  # where it is raised in a destructor, nothing can be done but wait for the end
+    raise Interrupted
+
+
+def _ignore_signals() -> None:
+    """Once is enough: another one must not disturb the end."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _supervised(child: int) -> int:
@@ -85,18 +98,19 @@ def _supervised(child: int) -> int:
         signal.signal(number, forward)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     _, status = os.waitpid(child, 0)  # a zombie until here, so the signals found it
-    for number in (*SIGNALS, signal.SIGALRM):
-        signal.signal(number, signal.SIG_IGN)
+    signal.alarm(0)
+    _ignore_signals()
     code = os.waitstatus_to_exitcode(status)
-    if code < 0:
-        _say(received[0] if received else -code)
-        return 128 + (received[0] if received else -code)
-    return 128 + received[0] if received and code else code
+    if code < 0 or code - 128 in SIGNALS:
+        number = received[0] if received else abs(code) % 128
+        _say(number)
+        return 128 + number
+    return 128 + received[0] if received and code else code  # a command that failed has said why
 
 
 def _say(number: int) -> None:
-    """Why the command ended, in one line, as ``console.fail`` does."""
-    message = f"{reason(number)}; {GOES_ON}"
+    """Why the command ended, in one line. It is said here alone: the child may be killed while it ends."""
+    message = f"{_reason(number)}; the same command goes on from the last checkpoint"
     print(f"error: {message}", file=sys.stderr)
     if "--json" in sys.argv:
         import json
@@ -104,7 +118,7 @@ def _say(number: int) -> None:
         print(json.dumps({"error": message}), flush=True)
 
 
-def reason(number: int) -> str:
+def _reason(number: int) -> str:
     """What the signal ``number`` means for a person."""
     if number in SIGNALS:
         return {signal.SIGTERM: "terminated", signal.SIGINT: "interrupted"}[signal.Signals(number)]
