@@ -206,11 +206,8 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         durations = {}
         for scene in options.scenes:
-            for warm in ("warm", "whole"):  # the first one compiles kernels
-                shutil.rmtree(folder / scene / "run", ignore_errors=True)
-                planned = commands(scene, folder / scene)
-                durations[scene] = [complete(arguments) for arguments in planned]
-                print(f"{scene}, {warm}: {', '.join(f'{s:.1f} s' for s in durations[scene])}", file=sys.stderr)
+            durations[scene] = [complete(arguments) for arguments in commands(scene, folder / scene)]
+            print(f"{scene}, whole: {', '.join(f'{s:.1f} s' for s in durations[scene])}", file=sys.stderr)
             shutil.move(folder / scene / "run", folder / scene / "whole")
         end = time.monotonic() + 60 * options.minutes
         while time.monotonic() < end:

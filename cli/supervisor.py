@@ -127,4 +127,6 @@ def _reason(number: int) -> str:
 
 
 if __name__ == "__main__":
-    run()
+    from masiv.cli.supervisor import run as imported  # this module is another one than that which ``console`` imports
+
+    imported()
