@@ -127,6 +127,6 @@ def _reason(number: int) -> str:
 
 
 if __name__ == "__main__":
-    from masiv.cli.supervisor import run as imported  # this module is another one than that which ``console`` imports
+    from importlib import import_module
 
-    imported()
+    import_module("masiv.cli.supervisor").run()  # the module that ``console`` imports, too: this one is another
