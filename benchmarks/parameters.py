@@ -73,6 +73,8 @@ def fitted(run: Path, family: str, preset: str, out: Path | None) -> tuple[dict[
 
 
 def main() -> None:
+    from masiv.runfolder import RunFolder
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", metavar="RUN[:FAMILY]")
     parser.add_argument("--out", type=Path, help="keep the twins here")
@@ -83,8 +85,7 @@ def main() -> None:
     for argument in options.runs:
         name, _, family = argument.partition(":")
         run = Path(name)
-        record = yaml.safe_load((run / "run.yaml").read_text(encoding="utf-8"))
-        truth = yaml.safe_load((Path(record["scene"]["path"]) / "truth.yaml").read_text(encoding="utf-8"))["material"]
+        truth = yaml.safe_load((RunFolder.open(run).scene_path / "truth.yaml").read_text(encoding="utf-8"))["material"]
         family = family or FAMILY[truth["type"]]
         law, fit, seconds = fitted(run, family, options.preset, options.out)
         expected = true_parameters(truth) if law["kind"] == FAMILY[truth["type"]] else {}

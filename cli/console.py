@@ -7,13 +7,16 @@ import json
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
-from typing import Any
+from typing import Any, NoReturn
 
 import typer
 
 from masiv.errors import InputError, MasivError
+
+from .supervisor import interrupted_by
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 PLAIN_EVERY_S = 15.0
@@ -30,21 +33,14 @@ def command(function: Callable[..., tuple[dict[str, Any], str]]) -> Callable[...
     def wrapped(*args: Any, **kwargs: Any) -> None:
         as_json = bool(kwargs.get("as_json"))
         try:
-            with _quiet_stdout(as_json):
+            with _quiet_stdout(as_json), _one_line_warnings():
                 data, text = function(*args, **kwargs)
-        except MasivError as error:
-            fail(str(error), BAD_INPUT if isinstance(error, InputError) else FAILED, as_json)
         except KeyboardInterrupt:
             fail("interrupted; the same command goes on from the last checkpoint", INTERRUPTED, as_json)
         except Exception as error:
-            import traceback
-
-            traceback.print_exc()
-            fail(
-                f"unexpected {type(error).__name__}: {error}; this is a bug, please report the lines above",
-                FAILED,
-                as_json,
-            )
+            if interrupted_by:
+                raise
+            _fail_with(error, as_json)
         else:
             if as_json:
                 from masiv.files import plain
@@ -55,7 +51,17 @@ def command(function: Callable[..., tuple[dict[str, Any], str]]) -> Callable[...
     return wrapped
 
 
-def fail(message: str, code: int, as_json: bool) -> None:
+def _fail_with(error: Exception, as_json: bool) -> NoReturn:
+    """Say what ``error`` means, and exit with its code."""
+    if isinstance(error, MasivError):
+        fail(str(error), BAD_INPUT if isinstance(error, InputError) else FAILED, as_json)
+    import traceback
+
+    traceback.print_exception(error)
+    fail(f"unexpected {type(error).__name__}: {error}; this is a bug, please report the lines above", FAILED, as_json)
+
+
+def fail(message: str, code: int, as_json: bool) -> NoReturn:
     """Print what went wrong, in one sentence, and exit with ``code``."""
     print(f"error: {message}", file=sys.stderr)
     if as_json:
@@ -79,6 +85,22 @@ def _quiet_stdout(quiet: bool) -> Iterator[None]:
     finally:
         os.dup2(kept, 1)
         os.close(kept)
+
+
+@contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Print what masiv warns of (a UserWarning) as one line, without the place in the code."""
+    with warnings.catch_warnings():
+        shown = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any) -> None:
+            if category is UserWarning:
+                print(f"warning: {message}", file=sys.stderr)
+            else:
+                shown(message, category, *place)
+
+        warnings.showwarning = show
+        yield
 
 
 @contextmanager

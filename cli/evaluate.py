@@ -7,7 +7,16 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, overrides
+from .options import (
+    ArchOption,
+    ConfigOption,
+    JsonOption,
+    MovedSceneOption,
+    PresetOption,
+    RunArgument,
+    SeedOption,
+    overrides,
+)
 
 
 def evaluate(
@@ -16,6 +25,7 @@ def evaluate(
         Path | None,
         typer.Option("--truth", help="Folder with particles_F.npy, (P, 3) metres a frame; not for tracks."),
     ] = None,
+    scene: MovedSceneOption = None,
     config: ConfigOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
@@ -32,7 +42,7 @@ def evaluate(
 
     from .console import progress_bar
 
-    opened = reopen_run(run, overrides(preset, config, seed, arch))
+    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
     with progress_bar() as progress:
         result = opened.evaluate(truth, progress)
     return result.data, result.text

@@ -48,7 +48,8 @@ def options(
 
 
 def run() -> None:
-    """The entry point. A wrong option is bad input: one sentence, exit code 2."""
+    """Run the command line in this process; ``supervisor.run`` is what users start. A wrong option is bad input: one
+    sentence, exit code 2."""
     try:
         code = app(standalone_mode=False)
     except Exception as error:
@@ -68,4 +69,6 @@ def run() -> None:
 
 
 if __name__ == "__main__":
-    run()
+    from .supervisor import run as supervised
+
+    supervised()

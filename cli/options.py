@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 SceneArgument = Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a scene.", show_default=False)]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.", show_default=False)]
+MovedSceneOption = Annotated[
+    Path | None, typer.Option("--scene", help="Where the run's scene is now. [default: where it was, seen from RUN]")
+]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="YAML with settings; over the preset, under flags.")
 ]

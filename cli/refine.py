@@ -7,7 +7,16 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, overrides
+from .options import (
+    ArchOption,
+    ConfigOption,
+    JsonOption,
+    MovedSceneOption,
+    PresetOption,
+    RunArgument,
+    SeedOption,
+    overrides,
+)
 
 
 def refine(
@@ -29,6 +38,7 @@ def refine(
         bool,
         typer.Option("--relearn", help="Learn the neural law again with the effects. [default: the classical law]"),
     ] = False,
+    scene: MovedSceneOption = None,
     config: ConfigOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
@@ -48,7 +58,7 @@ def refine(
     from .console import progress_bar
 
     request = RefineRequest(second, group, condition, dry_run, relearn)
-    opened = reopen_run(run, overrides(preset, config, seed, arch))
+    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
     with progress_bar() as progress:
         result = opened.refine(request, progress)
     return result.data, result.text

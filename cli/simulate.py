@@ -7,7 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, overrides, vector
+from .options import (
+    ArchOption,
+    ConfigOption,
+    JsonOption,
+    MovedSceneOption,
+    PresetOption,
+    RunArgument,
+    SeedOption,
+    overrides,
+    vector,
+)
 
 
 def simulate(
@@ -42,7 +52,9 @@ def simulate(
         list[str] | None,
         typer.Option("--without", metavar="EFFECT", help="Leave out an effect of the twin; may be repeated."),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Where to write. [default: RUN/simulate]")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Where to write; no run folder. [default: RUN_simulate, here]")
+    ] = None,
     condition: Annotated[
         str | None, typer.Option("--condition", help="Tracks: with what acts in the runs of this condition.")
     ] = None,
@@ -50,6 +62,7 @@ def simulate(
     view: Annotated[
         list[int] | None, typer.Option("--view", help="Camera to draw; may be repeated. [default: 0]")
     ] = None,
+    scene: MovedSceneOption = None,
     config: ConfigOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
@@ -86,7 +99,7 @@ def simulate(
         render=render,
         view=tuple(view or ()),
     )
-    opened = reopen_run(run, overrides(preset, config, seed, arch))
+    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
     with progress_bar() as progress:
-        result = opened.simulate(request, out or run / "simulate", progress)
+        result = opened.simulate(request, out or Path(f"{run.resolve().name}_simulate"), progress)
     return result.data, result.text

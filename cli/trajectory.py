@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, RunArgument, SeedOption, overrides
+from .options import (
+    ArchOption,
+    ConfigOption,
+    JsonOption,
+    MovedSceneOption,
+    PresetOption,
+    RunArgument,
+    SeedOption,
+    overrides,
+)
 
 
 def trajectory(
     run: RunArgument,
+    scene: MovedSceneOption = None,
     config: ConfigOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
@@ -23,7 +33,7 @@ def trajectory(
 
     from .console import progress_bar
 
-    opened = reopen_run(run, overrides(preset, config, seed, arch))
+    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
     with progress_bar() as progress:
         result = opened.trajectory(progress)
     return result.data, result.text

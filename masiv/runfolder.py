@@ -1,14 +1,16 @@
 """The run folder: names of its files, what was asked, and how far each stage is.
 
 ``run.yaml`` is written completely or not at all, so a killed run leaves a readable one. A stage that is
-``running`` in it was interrupted or failed; starting it again goes on from its checkpoint.
+``running`` in it was interrupted or failed; starting it again goes on from its checkpoint. Every file and key:
+docs/run_folder.md.
 """
 
 from __future__ import annotations
 
+import os
 import platform
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -20,10 +22,13 @@ import numpy as np
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
-from masiv.files import write_yaml
+from masiv.files import remove_temporary, write_yaml
+from masiv.folder_lock import locked
+from masiv.scene.scene import Ground
 from masiv.strict import read_yaml
 
-SCHEMA = 1
+SCHEMA = 2
+"""Format of the folder. In schema 1, paths of the scene and of other runs were absolute; it is read, too."""
 STAGES = ("reconstruct", "trajectory", "identify")
 # The parts of the configuration that change what a stage makes. Stages later in STAGES depend on all the earlier ones.
 SECTIONS = {
@@ -61,27 +66,55 @@ class RunFolder:
                 f"{path} is not a run folder (no run.yaml): make one with masiv reconstruct or masiv identify"
             )
         record = read_yaml(path / "run.yaml")
-        if record.get("schema") != SCHEMA or not {"config", "scene", "split", "stages"} <= record.keys():
+        schema = record.get("schema")
+        if isinstance(schema, int) and schema > SCHEMA:
+            raise InputError(
+                f"{path / 'run.yaml'} has schema {schema}, and this masiv reads 1 to {SCHEMA}: install a newer version"
+            )
+        if schema not in (1, SCHEMA) or not {"config", "scene", "split", "stages"} <= record.keys():
             raise InputError(
                 f"{path / 'run.yaml'} was not written by this version of masiv: start a new run with --out"
             )
         from masiv.config import renamed_keys
 
         record["config"] = renamed_keys(record["config"])
-        return cls(path, record)
+        return cls(path, _with_paths(record, lambda other: str((path.resolve() / other).resolve())))
 
     @classmethod
     def create_or_resume(cls, path: Path, request: Request) -> RunFolder:
         """A new run, or an existing one that was asked the same. Raises InputError saying what differs."""
-        if (path / "run.yaml").is_file():
-            run = cls.open(path)
-            run._accept(request)
-        elif path.exists() and (not path.is_dir() or any(path.iterdir())):
+        known = (path / "run.yaml").is_file()
+        if (
+            not known
+            and path.exists()
+            and (not path.is_dir() or any(not p.name.startswith("lock.") for p in path.iterdir()))
+        ):
             raise InputError(f"{path} exists and is not a run folder: give another one with --out")
-        else:
-            run = cls(path, _new_record(request))
-        run._write()
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{path} cannot be made: {error.strerror}; give another folder with --out") from error
+        run = cls(path, _new_record(request))
+        with run.locked():
+            run.accept(request)
         return run
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the run's lock, see ``masiv.folder_lock``, from the state in which the last process left the run."""
+        with locked(self.path) as taken_over:
+            if taken_over:
+                remove_temporary(self.path)
+            if (self.path / "run.yaml").is_file():
+                self.record = RunFolder.open(self.path).record
+            yield
+
+    def accept(self, request: Request) -> None:
+        """Record ``request``. Raises InputError if the run was asked something else, and says what differs."""
+        self.check(request)
+        asked = _new_record(request)
+        self.record |= {key: asked[key] for key in ("schema", "config", "scene", "versions")}
+        self._write()
 
     # -- names --------------------------------------------------------------------------------------------------
 
@@ -100,6 +133,26 @@ class RunFolder:
     @property
     def holdout_cameras(self) -> tuple[int, ...]:
         return tuple(self.record["split"]["holdout_cameras"])
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the scene, held-out ones included."""
+        return self.record["scene"]["frames"]
+
+    @property
+    def times(self) -> np.ndarray:
+        """(T,) [s] of the frames."""
+        return np.arange(self.frame_count) / self.record["scene"]["fps"]
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """(3,) [m/s^2]."""
+        return np.array(self.record["scene"]["gravity_m_s2"])
+
+    @property
+    def ground(self) -> Ground | None:
+        ground = self.record["scene"]["ground"]
+        return None if ground is None else Ground(np.array(ground["normal"]), ground["height_m"])
 
     @property
     def masks(self) -> Path:
@@ -172,33 +225,55 @@ class RunFolder:
     def _begun(self, stage: str) -> bool:
         return self.record["stages"][stage]["state"] != PENDING
 
-    def _accept(self, request: Request) -> None:
+    def check(self, request: Request) -> None:
+        """Raises InputError if the run was asked something else than ``request``, and says what differs."""
+        self.check_scene(request.scene, request.scene_path)
         asked = _new_record(request)
         differences = [
-            f"scene {key} {self.record['scene'].get(key)!r} → {value!r}"
-            for key, value in asked["scene"].items()
-            if key != "path" and self.record["scene"].get(key) != value
-        ]
-        differences += [
             f"{key} {self.record['split'].get(key)!r} → {value!r}"
             for key, value in asked["split"].items()
             if self.record["split"].get(key) != value
         ]
-        sections = [s for stage in STAGES if self._begun(stage) for s in SECTIONS[stage]]
-        made_with = _with_defaults(self.config)
-        for key in ["seed", *sections]:
-            differences += _differences(key, made_with.get(key), asked["config"].get(key))
+        differences += self._changed_settings(asked["config"])
         if differences:
             raise InputError(
-                f"{self.path} holds a run that was asked something else ({'; '.join(differences[:4])}"
-                f"{'; …' if len(differences) > 4 else ''}): give another folder with --out, or the same settings"
+                f"{self.path} holds a run that was asked something else ({_first(differences)}): give another folder "
+                "with --out, or the same settings"
             )
-        self.record["config"] = asked["config"]
-        self.record["scene"] = asked["scene"]
-        self.record["versions"] = asked["versions"]
+
+    def check_settings(self, config: Mapping[str, Any]) -> None:
+        """Raises InputError if a stage that has begun was asked something else than ``config``."""
+        if differences := self._changed_settings(config):
+            raise InputError(f"{self.path} was made with other settings ({_first(differences)}): leave them out")
+
+    def check_scene(self, scene: Mapping[str, Any], path: Path) -> None:
+        """Raises InputError if ``scene`` (``masiv.observations.identity``), read from ``path``, is not the run's."""
+        differences = [
+            f"scene {key} {self.record['scene'].get(key)!r} → {value!r}"
+            for key, value in scene.items()
+            if self.record["scene"].get(key) != value
+        ]
+        if differences:
+            raise InputError(
+                f"{path} is not the scene of the run {self.path} ({_first(differences)}): give the run's scene, or "
+                "another folder with --out"
+            )
+
+    def _changed_settings(self, config: Mapping[str, Any]) -> list[str]:
+        """What differs between ``config`` and what the stages that have begun were asked."""
+        made_with = _with_defaults(self.config)
+        sections = [s for stage in STAGES if self._begun(stage) for s in SECTIONS[stage]]
+        return [d for key in ["seed", *sections] for d in _differences(key, made_with.get(key), config.get(key))]
 
     def _write(self) -> None:
-        write_yaml(self.path / "run.yaml", self.record)
+        folder = self.path.resolve()
+        write_yaml(self.path / "run.yaml", _with_paths(self.record, lambda other: _relative(other, folder)))
+
+
+def refuse_run(folder: Path, option: str) -> None:
+    """Raises InputError if ``folder``, given with ``option``, is a run, of which a result would replace something."""
+    if (folder / "run.yaml").exists():
+        raise InputError(f"{option} {folder} is a run folder: give another one, so that nothing of the run is replaced")
 
 
 def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -210,16 +285,44 @@ def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(f"{path} is not a rollout saved by masiv ({error})") from error
 
 
+def _is_empty(folder: Path) -> bool:
+    """Whether ``folder`` is one with nothing in it but perhaps the lock of a run that was killed before it began."""
+    return folder.is_dir() and all(path.name.startswith("lock.") for path in folder.iterdir())
+
+
+def _first(differences: list[str]) -> str:
+    return "; ".join(differences[:4]) + ("; …" if len(differences) > 4 else "")
+
+
+def _relative(path: str, folder: Path) -> str:
+    """``path`` as seen from ``folder``, so that both can be moved together."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # on another drive
+        return path
+
+
+def _with_paths(record: Mapping[str, Any], convert: Callable[[str], str]) -> dict[str, Any]:
+    """``record`` with ``convert`` applied to the paths in it: of the scene, and of other recordings of the object."""
+    new = {**record, "scene": {**record["scene"], "path": convert(record["scene"]["path"])}}
+    section = record["config"].get("identify")
+    if section and section.get("also"):
+        section = {**section, "also": [convert(path) for path in section["also"]]}
+        new["config"] = {**record["config"], "identify": section}
+    return new
+
+
 def _new_record(request: Request) -> dict[str, Any]:
-    return {
+    record = {
         "schema": SCHEMA,
         "created": _now(),
-        "scene": {"path": str(request.scene_path.resolve()), **request.scene},
+        "scene": {"path": str(request.scene_path), **request.scene},
         "split": {"fit_frames": request.fit_frames, "holdout_cameras": list(request.holdout_cameras)},
         "config": dict(request.config),
         "versions": _versions(),
         "stages": {stage: {"state": PENDING} for stage in STAGES},
     }
+    return _with_paths(record, lambda path: str(Path(path).resolve()))
 
 
 def _with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,15 +12,19 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import signal
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker, util
 from pathlib import Path
 from typing import Any
 
 from masiv import runtime
 from masiv.errors import InputError, MasivError
+from masiv.parent import end_with_parent
 
 ONE_THREAD: dict[str, str] = dict.fromkeys(
     ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
@@ -54,9 +58,10 @@ def unwrap(result: Any) -> Any:
 class Workers:
     """A pool of ``processes`` that run tasks; with 1, tasks run in this process.
 
-    Use as a context. The processes start with the first task; if the block raises, they are terminated at once. key:
-    of the configuration, that sets their number, for messages. A script that uses more than one process needs
-    ``if __name__ == "__main__":``, as always with ``multiprocessing``.
+    Use as a context. The processes start with the first task. If the block raises, they are terminated at once, and if
+    this process is killed, they end, too; Ctrl-C reaches this process alone. key: of the configuration, that sets their
+    number, for messages. A script that uses more than one process needs ``if __name__ == "__main__":``, as always with
+    ``multiprocessing``.
     """
 
     def __init__(self, processes: int = 1, key: str = "refine.processes") -> None:
@@ -130,27 +135,48 @@ class Workers:
         if self._pool is None:
             others = set(multiprocessing.active_children())
             spawn = multiprocessing.get_context("spawn")  # Taichi's threads do not survive a fork
-            self._pool = ProcessPoolExecutor(self.processes, spawn, _initialize, (runtime.running_arch(),))
-            for _ in range(self.processes):  # a pool starts a process for each task that no idle process can take
-                self._pool.submit(_do_nothing)
-            self._started = set(multiprocessing.active_children()) - others
+            arguments = (runtime.running_arch(), os.getpid())
+            self._pool = ProcessPoolExecutor(self.processes, spawn, _initialize, arguments)
+            try:
+                with _interrupts_not_inherited():
+                    for _ in range(self.processes):  # a pool starts a process for each task that no idle one can take
+                        self._pool.submit(_do_nothing)
+            finally:  # an interruption, too, has to find those that have started
+                self._started = set(multiprocessing.active_children()) - others
         return self._pool
 
 
-def _initialize(arch: str) -> None:
-    """Limit a new process to one thread and start Taichi.
+@contextmanager
+def _interrupts_not_inherited() -> Iterator[None]:
+    """Processes that start in this block never get SIGINT, which a terminal sends to all; not even while they import.
+    This process gets it when the block ends."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    if hasattr(resource_tracker, "ensure_running"):
+        resource_tracker.ensure_running()  # its start would unblock the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _initialize(arch: str, parent: int) -> None:
+    """Let a new process end with the process ``parent``, limit it to one thread and start Taichi.
 
     The variables act on libraries that the caller's script has not imported yet, the calls on torch and Taichi.
     """
+    started_by = multiprocessing.parent_process()
+    assert started_by is not None
+    end_with_parent(parent, started_by.join)
     os.environ.update(ONE_THREAD)
-    import multiprocessing.util
-
     import torch
 
     ti = runtime.start(arch)
     torch.set_num_threads(1)
     # Such a process does not call the functions of ``atexit``. This one writes the cache of compiled kernels.
-    multiprocessing.util.Finalize(None, ti.reset, exitpriority=1)
+    util.Finalize(None, ti.reset, exitpriority=1)
 
 
 def _do_nothing() -> None:

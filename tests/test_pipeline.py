@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from run_folder_page import missing
 from small import SMALL
 
 SPEC = {
@@ -139,6 +140,14 @@ def test_evaluate_separates_observed_from_future(folder, whole):
     twin = numbers["motion"]["twin"]
     assert twin["observed"]["frames"] == [0, 1, 2, 3, 4]
     assert twin["future"]["frames"] == [5]
+    shutil.copytree(whole, folder / "alone/whole")
+    alone = done("evaluate", folder / "alone/whole", "--truth", folder / "gt")
+    assert alone["motion"] == numbers["motion"]
+    assert numbers["twin"]
+    assert (alone["reconstruction"], alone["twin"]) == (None, None)
+    again = done("evaluate", folder / "alone/whole", "--truth", folder / "gt", "--scene", folder / "scene")
+    assert again["twin"] == numbers["twin"]
+    assert missing(whole, "pictures") == []
     rigid = numbers["motion"]["rigid, stops at the ground"]
     assert twin["observed"]["tracked_error_mm"] < 25
     assert twin["future"]["tracked_error_mm"] < rigid["future"]["tracked_error_mm"]
@@ -146,7 +155,8 @@ def test_evaluate_separates_observed_from_future(folder, whole):
 
 @pytest.mark.slow
 def test_simulate_starts_from_the_identified_motion(folder, whole):
-    done("simulate", whole, "--frames", 3, "--out", folder / "same")
+    shutil.copytree(whole, folder / "moved/whole")
+    done("simulate", folder / "moved/whole", "--frames", 3, "--out", folder / "same")  # without the scene
     as_filmed, again = (np.load(path / "rollout.npz")["positions"] for path in (whole, folder / "same"))
     assert np.array_equal(as_filmed[:3], again)
     done(

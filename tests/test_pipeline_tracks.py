@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from run_folder_page import missing
 
 import masiv
 from masiv.pipeline import Overrides, RefineRequest, SceneRequest, SimulateRequest
@@ -57,6 +59,46 @@ def test_a_dry_run_leaves_an_earlier_result_alone(run):
     assert not ranked["accepted"]
     assert {name: (run.path / name).read_bytes() for name in kept} == kept
     assert json.loads((run.path / "refine.dry_run.json").read_text())["candidates"]
+
+
+def content(folder: Path) -> dict[str, tuple[bytes, int]]:
+    return {str(p): (p.read_bytes(), p.stat().st_mtime_ns) for p in folder.rglob("*") if p.is_file()}
+
+
+def test_simulate_needs_no_scene_and_writes_nothing_into_the_run(run, tmp_path):
+    run.simulate(SimulateRequest(4), tmp_path / "expected")
+    alone = shutil.move(run.path, tmp_path / "elsewhere" / "run")
+    before = content(alone)
+    masiv.reopen_run(alone).simulate(SimulateRequest(4), tmp_path / "found")
+    assert content(alone) == before
+    expected, found = ((tmp_path / name / "rollout.npz").read_bytes() for name in ("expected", "found"))
+    assert found == expected
+
+
+def test_simulate_does_not_write_into_a_run_folder(run):
+    before = content(run.path)
+    with pytest.raises(masiv.InputError, match="is a run folder"):
+        run.simulate(SimulateRequest(4), run.path)
+    assert content(run.path) == before
+
+
+def test_the_scene_of_a_moved_run_is_given_anew_and_remembered(run, tmp_path):
+    alone = shutil.move(run.path, tmp_path / "elsewhere" / "run")
+    with pytest.raises(masiv.InputError, match="say where it is with --scene"):
+        masiv.reopen_run(alone).evaluate(None)
+    with pytest.raises(masiv.InputError, match="not the scene of the run"):
+        masiv.reopen_run(alone, scene=BALLS.parent / "bar").evaluate(None)
+    with pytest.raises(masiv.InputError, match=r"--scene .*/none does not exist"):
+        masiv.reopen_run(alone, scene=tmp_path / "none")
+    numbers = masiv.reopen_run(alone, scene=BALLS).evaluate(None).data
+    assert masiv.reopen_run(alone).evaluate(None).data == numbers
+
+
+def test_the_page_names_every_file_and_key(run):
+    run.refine(RefineRequest(group=True))
+    run.refine(RefineRequest(group=True, dry_run=True))
+    run.evaluate(None)
+    assert missing(run.path, "tracks") == []
 
 
 @pytest.mark.parametrize("condition", ["dry_run", "load.dry_run", ".", "..", "../x", "wind/2", "CON", "a:b"])

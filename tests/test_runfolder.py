@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+
 import numpy as np
 import pytest
 import yaml
@@ -70,7 +73,7 @@ def test_the_same_request_resumes_and_another_is_refused(tmp_path):
     cases = [
         (request(tmp_path, fit_frames=10), "fit_frames 12 → 10"),
         (request(tmp_path, holdout=()), "holdout_cameras"),
-        (request(tmp_path, scene={**SCENE, "fps": 30.0}), "scene fps 24.0 → 30.0"),
+        (request(tmp_path, scene={**SCENE, "fps": 30.0}), "not the scene of the run.*scene fps 24.0 → 30.0"),
         (request(tmp_path, reconstruct__iterations=7), "reconstruct.iterations"),
     ]
     for asked, message in cases:
@@ -128,6 +131,57 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
     assert [p.name for p in (tmp_path / "photos").iterdir()] == ["cat.jpg"]
     with pytest.raises(InputError, match="not a run folder"):
         RunFolder.open(tmp_path)
+
+
+def test_a_run_and_its_scene_can_be_moved_together(tmp_path):
+    (tmp_path / "here").mkdir()
+    asked = request(tmp_path / "here", identify__also=[str(tmp_path / "here/other")])
+    RunFolder.create_or_resume(tmp_path / "here/runs/run", asked)
+    assert yaml.safe_load((tmp_path / "here/runs/run/run.yaml").read_text())["scene"]["path"] == "../../scene"
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    moved = RunFolder.open(tmp_path / "there/runs/run")
+    assert moved.scene_path == tmp_path / "there/scene"
+    assert moved.config["identify"]["also"] == [str(tmp_path / "there/other")]
+    again = request(tmp_path / "there", identify__also=[str(tmp_path / "there/other")])
+    RunFolder.create_or_resume(moved.path, again)
+
+
+def test_a_run_of_schema_1_is_read_and_becomes_one_of_schema_2(tmp_path):
+    path = tmp_path / "run"
+    RunFolder.create_or_resume(path, request(tmp_path))
+    record = yaml.safe_load((path / "run.yaml").read_text())
+    record |= {"schema": 1, "scene": {**record["scene"], "path": str(tmp_path / "scene")}}
+    (path / "run.yaml").write_text(yaml.safe_dump(record))
+    assert RunFolder.open(path).scene_path == tmp_path / "scene"
+    RunFolder.create_or_resume(path, request(tmp_path))
+    again = yaml.safe_load((path / "run.yaml").read_text())
+    assert (again["schema"], again["scene"]["path"]) == (2, "../scene")
+    (path / "run.yaml").write_text(yaml.safe_dump({**again, "schema": 3}))
+    with pytest.raises(InputError, match=r"schema 3.*newer version"):
+        RunFolder.open(path)
+
+
+def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
+    path = tmp_path / "run"
+    run = RunFolder.create_or_resume(path, request(tmp_path))
+    (path / "checkpoints").mkdir()
+    for name in ("rollout.123.tmp.npz", "checkpoints/identify.123.tmp.pt", "mine.tmp.npz"):
+        (path / name).touch()
+    with run.locked():
+        assert (path / "rollout.123.tmp.npz").exists()  # of a process that may be at work
+    (path / "lock.json").write_text("{}")
+    os.utime(path / "lock.json", (0, 0))
+    with pytest.warns(UserWarning, match="has ended"), run.locked():
+        assert {p.name for p in path.rglob("*.tmp.*")} == {"mine.tmp.npz"}
+
+
+def test_a_lock_sees_the_state_in_which_another_process_left_the_run(tmp_path):
+    one, other = (RunFolder.create_or_resume(tmp_path / "run", request(tmp_path)) for _ in range(2))
+    with one.locked(), one.stage("reconstruct"):
+        pass
+    assert not other.done("reconstruct")
+    with other.locked():
+        assert other.done("reconstruct")
 
 
 def test_motion_round_trip(tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,25 +13,45 @@ from masiv.config import Config, load_config
 from masiv.errors import InputError
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary
 from masiv.progress import Progress, silent
-from masiv.runfolder import RunFolder
+from masiv.runfolder import Request, RunFolder
 
 
 class Run(ABC):
     """The stages of a run folder. A stage runs only if the folder lacks its artefacts; a killed one resumes.
 
     Subclasses differ in what was observed: pictures (``masiv.pipeline.video``) or tracks (``masiv.pipeline.tracks``).
+    The scene is read when a stage needs it. What changes the folder holds its lock; ``simulate`` only reads.
     """
 
     layouts: ClassVar[str]
     """What the scenes of this kind are made of, for messages."""
 
-    def __init__(self, folder: RunFolder, config: Config) -> None:
+    def __init__(self, folder: RunFolder, config: Config, scene: Path) -> None:
         self.folder = folder
         self.config = config
+        self.scene_path = scene
 
     @property
     def path(self) -> Path:
         return self.folder.path
+
+    @abstractmethod
+    def request(self) -> Request:
+        """What is asked of the run now. Reads the scene. Raises InputError if it is not there or not the run's."""
+
+    @contextmanager
+    def changing(self) -> Iterator[None]:
+        """Hold the run's lock, and record what is asked of the run now. Raises InputError."""
+        request = self.request()
+        with self.folder.locked():
+            self.folder.accept(request)
+            yield
+
+    def existing_scene(self) -> Path:
+        """Where the scene is. Raises InputError if it is not there."""
+        if not self.scene_path.exists():
+            raise InputError(f"the scene of {self.path} is not at {self.scene_path}: say where it is with --scene")
+        return self.scene_path
 
     def start(self) -> None:
         """Start Taichi on the backend that the configuration names."""
@@ -42,11 +64,11 @@ class Run(ABC):
 
     def reconstruct(self, progress: Progress = silent) -> Summary:
         """Dynamic Gaussians. Raises InputError if there are no pictures."""
-        raise InputError(f"{self.folder.scene_path} holds {self.layouts}: there is nothing to reconstruct, identify it")
+        raise InputError(f"{self.scene_path} holds {self.layouts}: there is nothing to reconstruct, identify it")
 
     def trajectory(self, progress: Progress = silent) -> Summary:
         """The filled continuum and its motion. Raises InputError if there are no pictures."""
-        raise InputError(f"{self.folder.scene_path} holds {self.layouts}, which are trajectories: identify it")
+        raise InputError(f"{self.scene_path} holds {self.layouts}, which are trajectories: identify it")
 
     @abstractmethod
     def identify(self, progress: Progress = silent) -> Summary:
@@ -58,7 +80,8 @@ class Run(ABC):
 
     @abstractmethod
     def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
-        """A rollout under other conditions: ``out``/rollout.npz, and pictures if asked for."""
+        """A rollout under other conditions: ``out``/rollout.npz, and pictures if asked for. Writes nothing else, and
+        needs the scene for pictures alone. Raises InputError if ``out`` is a run folder."""
 
     @abstractmethod
     def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
@@ -83,14 +106,20 @@ def open_run(
     return kind.open(scene, folder, overrides or Overrides(), request or SceneRequest())
 
 
-def reopen_run(path: Path, overrides: Overrides | None = None, *, require: str | None = None) -> Run:
-    """The run in the folder ``path``. require: a stage that must be done. Raises InputError."""
+def reopen_run(
+    path: Path, overrides: Overrides | None = None, *, scene: Path | None = None, require: str | None = None
+) -> Run:
+    """The run in the folder ``path``; nothing is written. scene: where the scene is now (None: where it was); require:
+    a stage that must be done. Raises InputError."""
     folder = RunFolder.open(path)
     kind = _kinds()["tracks" if folder.record["scene"].get("layout") == "tracks" else "video"]
-    run = kind.open(folder.scene_path, path, overrides or Overrides(), SceneRequest())
+    config = settings(overrides or Overrides(), folder.config)
+    folder.check_settings(config.model_dump(mode="json"))
+    if scene is not None and not scene.exists():
+        raise InputError(f"--scene {scene} does not exist: give the folder of the run's scene")
     if require is not None:
-        run.folder.require(require)
-    return run
+        folder.require(require)
+    return kind(folder, config, scene or folder.scene_path)
 
 
 def inspect_scene(scene: Path, picture: Path | None = None, overrides: Overrides | None = None) -> Summary:

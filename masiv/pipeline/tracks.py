@@ -15,7 +15,7 @@ from masiv.observations.identity import identity
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
 from masiv.pipeline.run import Run, settings
 from masiv.progress import Progress, silent
-from masiv.runfolder import Request, RunFolder
+from masiv.runfolder import Request, RunFolder, refuse_run
 from masiv.strict import read_yaml
 from masiv.tracks.read import read_tracks
 from masiv.tracks.tracks import Tracks
@@ -42,9 +42,21 @@ class TracksRun(Run):
 
     layouts = "tracks"
 
-    def __init__(self, folder: RunFolder, config: Config, tracks: Tracks) -> None:
-        super().__init__(folder, config)
-        self.tracks = tracks
+    def __init__(self, folder: RunFolder, config: Config, scene: Path, read: Tracks | None = None) -> None:
+        super().__init__(folder, config, scene)
+        self._read = read
+
+    @property
+    def tracks(self) -> Tracks:
+        """Raises InputError if the scene is not there or not the run's."""
+        if self._read is None:
+            read = read_tracks(self.existing_scene())
+            self.folder.check_scene(identity(read), self.scene_path)
+            self._read = read
+        return self._read
+
+    def request(self) -> Request:
+        return Request(self.config.model_dump(mode="json"), self.scene_path, identity(self.tracks), 0)
 
     @classmethod
     def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> TracksRun:
@@ -68,10 +80,14 @@ class TracksRun(Run):
             )
         tracks = read_tracks(scene)
         asked = Request(config.model_dump(mode="json"), scene, identity(tracks), 0)
-        return cls(RunFolder.create_or_resume(out, asked), config, tracks)
+        return cls(RunFolder.create_or_resume(out, asked), config, scene, tracks)
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
+        with self.changing():
+            return self._identify(progress)
+
+    def _identify(self, progress: Progress) -> Summary:
         from masiv.identification.from_tracks import identify_tracks
         from masiv.report.numbers import given_or_error
 
@@ -101,9 +117,13 @@ class TracksRun(Run):
         return Summary(data, "\n".join([*lines, *_table(rows), f"report   {self.folder.report}"]))
 
     def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:
-        refuse(request, ("second_run", "relearn"), "pictures", self.folder.scene_path)
+        refuse(request, ("second_run", "relearn"), "pictures", self.scene_path)
         self.folder.require("identify")
         self.start()
+        with self.changing():
+            return self._refine(request, progress)
+
+    def _refine(self, request: RefineRequest, progress: Progress) -> Summary:
         from masiv.refinement.document import document, save_arrays, text
         from masiv.refinement.from_tracks import refine_tracks
         from masiv.refinement.to_twin import refined_twin
@@ -135,8 +155,9 @@ class TracksRun(Run):
         return Summary({"refine": str(self.path / f"{stem}.json"), **written}, text(written))
 
     def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
-        refuse(request, NOT_FOR_TRACKS, "pictures", self.folder.scene_path)
+        refuse(request, NOT_FOR_TRACKS, "pictures", self.scene_path)
         self.folder.require("identify")
+        refuse_run(out, "--out")
         self.start()
         from masiv.simulation.simulate import simulate
 
@@ -159,17 +180,18 @@ class TracksRun(Run):
     def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
         """Errors of every run, fitted and held out apart, before and after refine: evaluate.json."""
         if truth is not None:
-            raise InputError(f"--truth is for scenes of pictures: leave it out for {self.folder.scene_path}")
+            raise InputError(f"--truth is for scenes of pictures: leave it out for {self.scene_path}")
         self.folder.require("identify")
         self.start()
-        rows = self._report(self._load_twin(), progress)
-        numbers = {
-            "fit": [r for r in rows if r["use"] == "fit"],
-            "held_out": [r for r in rows if r["use"] == "hold_out"],
-            "test": [r for r in rows if r["use"] == "test"],
-            "unit": "mm",
-        }
-        write_json(self.folder.evaluation, numbers)
+        with self.changing():
+            rows = self._report(self._load_twin(), progress)
+            numbers = {
+                "fit": [r for r in rows if r["use"] == "fit"],
+                "held_out": [r for r in rows if r["use"] == "hold_out"],
+                "test": [r for r in rows if r["use"] == "test"],
+                "unit": "mm",
+            }
+            write_json(self.folder.evaluation, numbers)
         data = {"evaluation": str(self.folder.evaluation), **numbers}
         return Summary(data, "\n".join([*_table(rows), str(self.folder.evaluation)]))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from masiv.pipeline import stages
 from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
 from masiv.pipeline.run import Run, reopen_run, settings
 from masiv.progress import Progress, silent
-from masiv.runfolder import Request, RunFolder
+from masiv.runfolder import Request, RunFolder, refuse_run
 from masiv.scene.scene import Scene
 
 
@@ -26,14 +27,26 @@ class VideoRun(Run):
 
     layouts = "pictures"
 
-    def __init__(self, folder: RunFolder, config: Config, scene: Scene) -> None:
-        super().__init__(folder, config)
-        self._given = scene
+    def __init__(self, folder: RunFolder, config: Config, scene: Path, read: Scene | None = None) -> None:
+        super().__init__(folder, config, scene)
+        self._read = read
 
     @property
     def scene(self) -> Scene:
-        """All frames and cameras; after the reconstruct stage, the cameras that it refined."""
-        return stages.calibrated_scene(self.folder, self._given)
+        """All frames and cameras; after the reconstruct stage, the cameras that it refined. Raises InputError if the
+        scene is not there or not the run's."""
+        return stages.calibrated_scene(self.folder, self._given_scene())
+
+    def _given_scene(self) -> Scene:
+        if self._read is None:
+            read = read_scene(self.existing_scene())
+            self.folder.check_scene(identity(read), self.scene_path)
+            self._read = with_kept_masks(read, self.folder.masks)
+        return self._read
+
+    def request(self) -> Request:
+        split = self.folder.fit_frames, self.folder.holdout_cameras
+        return Request(self.config.model_dump(mode="json"), self.scene_path, identity(self._given_scene()), *split)
 
     @classmethod
     def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> VideoRun:
@@ -42,7 +55,8 @@ class VideoRun(Run):
         flags["reconstruct.refine_calibration"] = False if request.keep_calibration else None
         config = settings(overrides, existing.config if existing else None, **flags)
         read = read_scene(scene)
-        for other in config.identify.also:
+        identified = existing is not None and existing.done("identify")
+        for other in () if identified else config.identify.also:
             config.identify.require_neural_for_several()
             if Path(other).resolve() == out.resolve():
                 raise InputError(f"--also {other} is the run itself: give runs of other recordings of the same object")
@@ -54,10 +68,11 @@ class VideoRun(Run):
         read.restricted(fit_frames, cameras)
         asked = Request(config.model_dump(mode="json"), scene, identity(read), fit_frames, cameras)
         folder = RunFolder.create_or_resume(out, asked)
-        return cls(folder, config, with_kept_masks(read, folder.masks))
+        return cls(folder, config, scene, with_kept_masks(read, folder.masks))
 
     def reconstruct(self, progress: Progress = silent) -> Summary:
-        dynamic = stages.ensure_gaussians(self.folder, self.config, self.scene, progress)
+        with self.changing():
+            dynamic = stages.ensure_gaussians(self.folder, self.config, self.scene, progress)
         from masiv.report.numbers import reconstruction_numbers, table
 
         numbers = reconstruction_numbers(self.folder, self.scene, dynamic)
@@ -74,7 +89,8 @@ class VideoRun(Run):
         return Summary(data, f"{text}{table({'reconstruction': numbers})}")
 
     def trajectory(self, progress: Progress = silent) -> Summary:
-        made = stages.ensure_trajectory(self.folder, self.config, self.scene, progress)
+        with self.changing():
+            made = stages.ensure_trajectory(self.folder, self.config, self.scene, progress)
         frames, particles = made.positions.shape[:2]
         data = {
             "run": str(self.path),
@@ -96,6 +112,10 @@ class VideoRun(Run):
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
+        with self.changing():
+            return self._identify(progress)
+
+    def _identify(self, progress: Progress) -> Summary:
         from masiv.report.numbers import law_text, material_numbers, run_numbers, table
         from masiv.report.video import write_report
         from masiv.simulation.simulate import simulate
@@ -122,7 +142,7 @@ class VideoRun(Run):
         return Summary(data, f"{table(numbers)}\n{law_text(law, families)}report   {folder.report}")
 
     def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:
-        refuse(request, ("group", "condition"), "tracks", self.folder.scene_path)
+        refuse(request, ("group", "condition"), "tracks", self.scene_path)
         self.folder.require("identify")
         runs: list[VideoRun] = [self]
         if request.second_run is not None:
@@ -135,15 +155,21 @@ class VideoRun(Run):
         self.start()
         from masiv.pipeline.refine_video import refine_runs
 
-        return refine_runs(runs, request, progress)
+        with ExitStack() as changing:
+            for run in runs:
+                changing.enter_context(run.changing())
+            return refine_runs(runs, request, progress)
 
     def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
-        refuse(request, ("condition",), "tracks", self.folder.scene_path)
+        refuse(request, ("condition",), "tracks", self.scene_path)
         self.folder.require("identify")
+        refuse_run(out, "--out")
         views = request.view or (0,)
+        if request.view and not request.render:
+            raise InputError(f"--view {request.view[0]} says what --render draws: add --render")
         if request.render and not self.scene.cameras:
             raise InputError(f"{self.scene.path} has point clouds and no cameras: leave out --render")
-        for index in views if request.render or request.view else ():
+        for index in views if request.render else ():
             if not 0 <= index < len(self.scene.cameras):
                 raise InputError(f"--view {index}: the scene has cameras 0 to {len(self.scene.cameras) - 1}")
         if request.force is None and (request.force_from is not None or request.force_until is not None):
@@ -172,7 +198,7 @@ class VideoRun(Run):
         )
         twin = without_effects(twin, request.without)
         rollout = simulate(
-            twin, frames=request.frames, fps=self.scene.fps, velocity=request.velocity, omega=request.omega,
+            twin, frames=request.frames, velocity=request.velocity, omega=request.omega,
             gravity=request.gravity, force=force, progress=progress,
         )  # fmt: skip
         out.mkdir(parents=True, exist_ok=True)
@@ -195,6 +221,7 @@ class VideoRun(Run):
         if truth is None:
             raise InputError("--truth is missing: give the folder with particles_F.npy")
         self.folder.require("trajectory")
+        scene = self.scene if self.scene_path.exists() else None
         self.start()
         from masiv.report.numbers import evaluation_numbers, table
         from masiv.runfolder import load_motion
@@ -204,9 +231,10 @@ class VideoRun(Run):
         twin, rollout = None, None
         if self.folder.done("identify") and self.folder.rollout.is_file():
             twin, (rollout, _) = Twin.load(self.path), load_motion(self.folder.rollout)
-        numbers = evaluation_numbers(
-            self.folder, self.scene, dynamic, trajectory, twin, rollout, truth, progress=progress
-        )
-        write_json(self.folder.evaluation, numbers)
-        data = {"evaluation": str(self.folder.evaluation), **numbers}
-        return Summary(data, f"{table(numbers)}\n{self.folder.evaluation}")
+        numbers = evaluation_numbers(self.folder, scene, dynamic, trajectory, twin, rollout, truth, progress=progress)
+        with self.folder.locked():
+            write_json(self.folder.evaluation, numbers)
+        text = f"{table(numbers)}\n{self.folder.evaluation}"
+        if scene is None:
+            text += f"\nno pictures were compared: the scene is not at {self.scene_path}, say where it is with --scene"
+        return Summary({"evaluation": str(self.folder.evaluation), **numbers}, text)

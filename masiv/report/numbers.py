@@ -47,19 +47,19 @@ def twin_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollou
     if scene.load_cloud is not None:
         return {
             name: measure.cloud_numbers(scene, lambda f: binding.moved(rollout[f]), frames)
-            for name, frames in _split(run, scene)
+            for name, frames in _split(run)
         }
     views = list(range(len(scene.cameras)))
     return {
         name: measure.picture_numbers(scene, lambda f: binding.moved(rollout[f]), views, frames)
-        for name, frames in _split(run, scene)
+        for name, frames in _split(run)
     }
 
 
-def _split(run: RunFolder, scene: Scene) -> tuple[tuple[str, list[int]], ...]:
+def _split(run: RunFolder) -> tuple[tuple[str, list[int]], ...]:
     return (
         ("observed", list(range(run.fit_frames))),
-        ("future", list(range(run.fit_frames, scene.frame_count))),
+        ("future", list(range(run.fit_frames, run.frame_count))),
     )
 
 
@@ -104,7 +104,7 @@ def material_numbers(run: RunFolder) -> dict[str, Any]:
 
 def evaluation_numbers(
     run: RunFolder,
-    scene: Scene,
+    scene: Scene | None,
     dynamic: DynamicGaussians,
     trajectory: Trajectory,
     twin: Twin | None,
@@ -113,24 +113,25 @@ def evaluation_numbers(
     *,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """evaluate.json: against the true particles. ``twin`` and ``rollout`` are None where identify has not run.
+    """evaluate.json: against the true particles. ``twin`` and ``rollout`` are None where identify has not run. Without
+    ``scene`` there are no numbers of pictures.
 
     The baselines start as the twin does, or, without one, as the first step of the trajectory does.
     """
-    truth = measure.read_truth(truth_folder, scene.frame_count)
+    truth = measure.read_truth(truth_folder, run.frame_count)
     seed = int(run.config["seed"])
     motions = {"trajectory": trajectory.positions}
     rest = trajectory.positions[0].astype(np.float64)
-    velocity, omega = measure.initial_motion(trajectory.positions, trajectory.times, scene.gravity)
+    velocity, omega = measure.initial_motion(trajectory.positions, trajectory.times, run.gravity)
     if rollout is not None and twin is not None:
         motions["twin"] = rollout
         rest, velocity, omega = rollout[0].astype(np.float64), np.array(twin.velocity), np.array(twin.omega)
-    motions |= measure.baselines(rest, velocity, omega, scene.gravity, scene.times, scene.ground)
+    motions |= measure.baselines(rest, velocity, omega, run.gravity, run.times, run.ground)
     motion: dict[str, dict[str, Any]] = {}
     for done, (name, positions) in enumerate(motions.items()):
         progress("evaluate", done, len(motions))
         motion[name] = {
-            split: measure.motion_numbers(positions, truth, frames, seed=seed) for split, frames in _split(run, scene)
+            split: measure.motion_numbers(positions, truth, frames, seed=seed) for split, frames in _split(run)
         }
     progress("evaluate", len(motions), len(motions))
     floor = [metrics.chamfer_floor(points, seed=seed) for points in truth]
@@ -141,8 +142,8 @@ def evaluation_numbers(
         "chamfer_floor_1e3mm2": float(np.mean(floor)),
         "baseline_start": {"velocity_m_s": velocity.tolist(), "omega_rad_s": omega.tolist()},
         "motion": motion,
-        "reconstruction": reconstruction_numbers(run, scene, dynamic),
-        "twin": None if rollout is None else twin_numbers(run, scene, dynamic, rollout),
+        "reconstruction": None if scene is None else reconstruction_numbers(run, scene, dynamic),
+        "twin": None if scene is None or rollout is None else twin_numbers(run, scene, dynamic, rollout),
     }
 
 

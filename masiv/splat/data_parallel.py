@@ -4,7 +4,7 @@ Parameters and gradients are in memory that both processes map. The description 
 through pipes. Both processes compute a part in the same way, so a fit has the same bits with one process and with two.
 
 It is not a process of ``multiprocessing``: the caller's script is not imported again, so it needs no main guard. It is
-in a session of its own: Ctrl-C interrupts the caller only, which then closes the pipe that the process reads.
+in a session of its own: Ctrl-C interrupts the caller only, which then kills it. It ends if the caller is killed.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ Gradients = Sequence[torch.Tensor | None]
 EXIT_TIMEOUT_S = 10.0
 _COMMAND = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    "from masiv.parent import end_with_parent; end_with_parent(int(sys.argv[4])); "
     "from masiv.splat.data_parallel import serve; serve(int(sys.argv[2]), int(sys.argv[3]))"
 )
 """Imports from where this process does, as ``multiprocessing`` has it; PYTHONPATH stays as it is."""
@@ -80,7 +81,8 @@ class GradientWorker:
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(dir="/dev/shm" if os.path.isdir("/dev/shm") else None)
         threads = dict.fromkeys(ONE_THREAD, str(max(1, runtime.threads() // 2)))
-        arguments = (json.dumps(sys.path), str(self._file.fileno()), str(torch.get_num_threads()))
+        numbers = (self._file.fileno(), torch.get_num_threads(), os.getpid())
+        arguments = (json.dumps(sys.path), *map(str, numbers))
         self._process = subprocess.Popen(
             [sys.executable, "-c", _COMMAND, *arguments],
             stdin=subprocess.PIPE,
@@ -94,8 +96,10 @@ class GradientWorker:
     def __enter__(self) -> GradientWorker:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         assert self._process.stdin is not None and self._process.stdout is not None  # noqa: PT018
+        if kind is not None:
+            self._process.kill()
         try:
             self._process.stdin.close()
         except OSError:  # the process died
