@@ -13,7 +13,7 @@ from typing import Any
 
 import typer
 
-from masiv.errors import InputError, MasivError
+from masiv.errors import InputError, MasivError, of_system
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 PLAIN_EVERY_S = 15.0
@@ -32,8 +32,9 @@ def command(function: Callable[..., tuple[dict[str, Any], str]]) -> Callable[...
         try:
             with _quiet_stdout(as_json):
                 data, text = function(*args, **kwargs)
-        except MasivError as error:
-            fail(str(error), BAD_INPUT if isinstance(error, InputError) else FAILED, as_json)
+        except (MasivError, OSError, MemoryError) as error:
+            told = error if isinstance(error, MasivError) else of_system(error)
+            fail(str(told), BAD_INPUT if isinstance(told, InputError) else FAILED, as_json)
         except KeyboardInterrupt:
             fail("interrupted; the same command goes on from the last checkpoint", INTERRUPTED, as_json)
         except Exception as error:

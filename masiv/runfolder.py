@@ -20,8 +20,8 @@ import numpy as np
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
-from masiv.files import write_yaml
-from masiv.strict import read_yaml
+from masiv.files import check_motion, read_npz, write_yaml
+from masiv.strict import read_yaml, shortened
 
 SCHEMA = 1
 STAGES = ("reconstruct", "trajectory", "identify")
@@ -66,7 +66,9 @@ class RunFolder:
                 f"{path / 'run.yaml'} was not written by this version of masiv: start a new run with --out"
             )
         from masiv.config import renamed_keys
+        from masiv.run_record import check_record
 
+        check_record(record, path / "run.yaml")
         record["config"] = renamed_keys(record["config"])
         return cls(path, record)
 
@@ -204,10 +206,11 @@ class RunFolder:
 def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, Q, 3) float32 [m, world] and times (T,) [s] of a rollout.npz. Raises InputError."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return file["positions"], file["times"]
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path} is not a rollout saved by masiv ({error})") from error
+        file = read_npz(path)
+        check_motion(file["positions"], file["times"])
+    except (InputError, KeyError, ValueError) as error:
+        raise InputError(f"{path} is not a rollout saved by masiv ({shortened(error)})") from error
+    return file["positions"], file["times"]
 
 
 def _new_record(request: Request) -> dict[str, Any]:
