@@ -34,8 +34,8 @@ import cv2
 import numpy as np
 import yaml
 
-TIME_LIMIT_S = 60.0
-"""Of a command: the longest that ends takes 20 s of it."""
+TIME_LIMIT_S = 90.0
+"""Of a command: the longest takes 40 s, where a stage is done again."""
 MEMORY_LIMIT_MB = 2000
 """Of the resident memory: an ordinary command on this scene has half of that."""
 SPEC = {
@@ -426,7 +426,7 @@ def files_of_a_run() -> Iterator[Case]:
         ("with network settings that are no JSON", lambda a: a.update(network_settings="{")),
     ):
         yield Case(group, f"trajectory.npz {name}", EVALUATE, arrays("run/trajectory.npz", change))
-    yield Case(group, "metrics.json and material.json cut", AGAIN, lambda f: cut("run/material.json")(f))
+    yield Case(group, "material.json cut in half", AGAIN, cut("run/material.json"), goes_on=True)
     for name, data in (
         ("of random bytes", bytes(range(256)) * 20),
         ("empty", b""),

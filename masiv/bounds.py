@@ -30,9 +30,10 @@ class Bound:
         names the option, the key or the file."""
         size = float(np.linalg.norm(value)) if np.ndim(value) else float(value)
         if not (math.isfinite(size) and self.lower <= size <= self.upper):
+            unit = f" {self.unit}" if self.unit else ""
             raise InputError(
-                f"{where}: {self.name} {size:.4g} {self.unit} is not between {self.lower:g} and {self.upper:g} "
-                f"{self.unit} ({self.reason}): check the number and its unit"
+                f"{where}: {self.name} {size:.4g}{unit} is not between {self.lower:g} and {self.upper:g}{unit} "
+                f"({self.reason}): check the number and its unit"
             )
 
     def field(self) -> object:
@@ -52,7 +53,7 @@ LENGTH = Bound("length", 0, 1e6, "m", "gravity is not one vector over a thousand
 SIZE = Bound("longest side", 1e-6, 100, "m", "a continuum is not smaller, and buildings are not larger")
 VOLUME = Bound("volume", SIZE.lower**3, SIZE.upper**3, "m³", SIZE.reason)
 MASS = Bound("mass", DENSITY.lower * VOLUME.lower, DENSITY.upper * VOLUME.upper, "kg", "as of density and volume")
-FRICTION = Bound("coefficient of friction", 0, 10, "1", "rubber on rubber has 1 to 4")
+FRICTION = Bound("coefficient of friction", 0, 10, "", "rubber on rubber has 1 to 4")
 TIME = Bound("time", 0, 1e10, "s", "time stamps since 1970 are below 10¹⁰ s")
 PRESSURE = Bound("modulus", 0, 1e13, "Pa", "diamond has 1.2·10¹² Pa")
 VISCOSITY = Bound("viscosity", 0, 1e16, "Pa s", "ice of a glacier has 10¹³ Pa s, rock more")

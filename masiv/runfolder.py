@@ -21,7 +21,7 @@ import numpy as np
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.files import check_motion, read_npz, write_yaml
-from masiv.strict import read_yaml, shortened
+from masiv.strict import read_yaml, reason
 
 SCHEMA = 1
 STAGES = ("reconstruct", "trajectory", "identify")
@@ -209,7 +209,7 @@ def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
         file = read_npz(path)
         check_motion(file["positions"], file["times"])
     except (InputError, KeyError, ValueError) as error:
-        raise InputError(f"{path} is not a rollout saved by masiv ({shortened(error)})") from error
+        raise InputError(f"{path} is not a rollout saved by masiv ({reason(error, path)})") from error
     return file["positions"], file["times"]
 
 

@@ -39,7 +39,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         data = yaml.load(_text(path), _Loader)  # a SafeLoader
     except (yaml.YAMLError, *UNREADABLE) as error:
-        raise InputError(f"{path} is not valid YAML: {shortened(error)}") from error
+        detail = shortened(error).replace(' in "<unicode string>"', "")
+        raise InputError(f"{path} is not valid YAML: {detail}") from error
     if data is None:
         return {}
     if not isinstance(data, dict):
@@ -59,6 +60,11 @@ def shortened(value: object) -> str:
     """``value``, for example an error, as one line of a message that is not too long to read."""
     text = " ".join(str(value).split()) or type(value).__name__
     return text if len(text) <= 2 * _SHOWN else f"{text[: 2 * _SHOWN]}…"
+
+
+def reason(error: Exception, path: Path) -> str:
+    """Why ``path`` could not be read, for a sentence that names it already."""
+    return shortened(str(error).removeprefix(str(path)).lstrip(": ") or type(error).__name__)
 
 
 def quoted(value: object) -> str:
@@ -95,6 +101,8 @@ def _sentence(model: type[BaseModel], error: ValidationError, where: str) -> str
     first = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
     location = [str(part) for part in first["loc"]]
     dotted = ".".join(location)
+    if first["type"] == "missing":
+        return f"{where}: '{dotted}' is missing"
     if first["type"] != "extra_forbidden":
         return f"{where}: '{dotted}' is {quoted(first['input'])}: {first['msg'][:1].lower() + first['msg'][1:]}"
     known = _keys_at(model, location[:-1])

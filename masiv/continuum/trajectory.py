@@ -31,7 +31,7 @@ from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
-from masiv.strict import shortened
+from masiv.strict import reason
 
 _CHUNK = 8
 """Times that are evaluated together: limits the memory."""
@@ -98,7 +98,7 @@ class Trajectory:
             return cls(file["positions"], file["times"], spacing, volume, network, log_sd, mirror)
         except (InputError, KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
             raise InputError(
-                f"{path} is not a trajectory saved by masiv ({shortened(error)}); delete it and run masiv trajectory "
+                f"{path} is not a trajectory saved by masiv ({reason(error, path)}); delete it and run masiv trajectory "
                 "in a new folder"
             ) from error
 

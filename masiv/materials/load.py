@@ -13,7 +13,7 @@ from masiv.materials.adapter import AdapterLaw
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.law import Law
 from masiv.materials.neural import NeuralLaw
-from masiv.strict import shortened
+from masiv.strict import reason
 
 
 def load_law(path: Path) -> Law:
@@ -35,6 +35,6 @@ def load_law(path: Path) -> Law:
             estimated.stderr = json.loads(metadata.get("stderr", "{}"))
     except (InputError, KeyError, RuntimeError, ValueError, TypeError, RecursionError) as error:
         raise InputError(
-            f"{path} is not a law written by masiv ({shortened(error)}): run identify or pretrain again"
+            f"{path} is not a law written by masiv ({reason(error, path)}): run identify or pretrain again"
         ) from error
     return law

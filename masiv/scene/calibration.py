@@ -14,7 +14,7 @@ from masiv.errors import InputError
 from masiv.files import write_json
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
-from masiv.strict import read_json, shortened
+from masiv.strict import read_json, reason
 
 CALIBRATION = "calibration.json"
 _SCHEMA = 2
@@ -154,7 +154,7 @@ class Calibration:
     def load(cls, folder: Path) -> Calibration | None:
         """What ``save`` wrote into ``folder``; None if there is none. Raises InputError if it is broken."""
         path = Path(folder) / CALIBRATION
-        if not path.is_file():
+        if not path.exists():
             return None
         try:
             data = read_json(path)
@@ -170,7 +170,7 @@ class Calibration:
             )
         except (InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
-                f"{path} is not a calibration saved by masiv ({shortened(error)}): reconstruct anew"
+                f"{path} is not a calibration saved by masiv ({reason(error, path)}): reconstruct anew"
             ) from error
 
 

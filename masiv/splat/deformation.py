@@ -10,7 +10,7 @@ import torch
 
 from masiv.errors import InputError
 from masiv.files import read_safetensors, write_safetensors
-from masiv.strict import shortened
+from masiv.strict import reason
 
 
 class DeformationNetwork(torch.nn.Module):
@@ -151,7 +151,7 @@ class DeformationNetwork(torch.nn.Module):
             network.to(tensors["base_motion"].dtype).load_state_dict(tensors)
         except (InputError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise InputError(
-                f"{path} is not a motion saved by masiv ({shortened(error)}); run reconstruct again"
+                f"{path} is not a motion saved by masiv ({reason(error, path)}); run reconstruct again"
             ) from error
         return network
 

@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement
 
 from masiv.errors import InputError, MasivError
 from masiv.files import atomic, require_file
-from masiv.strict import shortened
+from masiv.strict import reason
 
 _SH_DEGREE_0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 1/2 + _SH_DEGREE_0 f_dc."""
@@ -64,7 +64,7 @@ class Gaussians:
             columns = {name: np.asarray(rows[name], dtype=np.float64) for name in _COLUMNS if name[0] != "n"}
         except Exception as error:  # the library raises what it likes for a damaged file
             raise InputError(
-                f"{path} is not a PLY file of Gaussians ({shortened(error)}); run reconstruct again"
+                f"{path} is not a PLY file of Gaussians ({reason(error, path)}); run reconstruct again"
             ) from error
         for name, column in columns.items():
             if not np.isfinite(column).all():

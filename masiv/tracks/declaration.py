@@ -7,12 +7,13 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
-from masiv.bounds import DENSITY, MASS, VISCOSITY, Density, Fps
+from masiv.bounds import DENSITY, MASS, SIZE, VISCOSITY, Density, Fps
 from masiv.scene.declaration import GroundDeclaration, SceneDeclaration, Vector
 
 Unit = Literal["m", "cm", "mm"]
 METRES: dict[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-Positive = Annotated[FiniteFloat, Field(gt=0)]
+Side = Annotated[FiniteFloat, Field(gt=0, le=SIZE.upper / METRES["mm"])]
+"""Of a body, in the unit of the geometry, which is a millimetre at least."""
 Axis = Literal["x", "y", "z"]
 Frame = Annotated[int, Field(ge=0, lt=2**31)]
 
@@ -24,8 +25,8 @@ class _Part(BaseModel):
 class CylinderDeclaration(_Part):
     """Its axis is z, its middle the origin."""
 
-    diameter: Positive
-    length: Positive
+    diameter: Side
+    length: Side
 
 
 class HalfSpaceDeclaration(_Part):
@@ -66,8 +67,8 @@ class GeometryDeclaration(_Part):
 
     units: Unit
     mesh: Path | None = None
-    box: tuple[Positive, Positive, Positive] | None = None
-    sphere: Positive | None = None
+    box: tuple[Side, Side, Side] | None = None
+    sphere: Side | None = None
     cylinder: CylinderDeclaration | None = None
     markers_at: dict[str, Vector] | None = None
     position: Vector | None = None

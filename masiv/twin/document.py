@@ -15,7 +15,7 @@ from masiv.errors import InputError
 from masiv.files import read_safetensors, write_safetensors, write_yaml
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
-from masiv.strict import read_yaml, shortened, validated
+from masiv.strict import read_yaml, reason, validated
 from masiv.tracks.placement import Placement
 from masiv.tracks.tracks import Clamp
 from masiv.twin.body import OFFSET_UNITS, Body, Boundary, InitialCondition, Release, TwinEffect
@@ -370,7 +370,7 @@ def read_particles(path: Path, tensor: str) -> np.ndarray:
         particles = read_safetensors(path)[0][tensor]
     except (InputError, KeyError) as error:
         raise InputError(
-            f"{path} does not hold the particles of body '{tensor}' ({shortened(error)}): identify again"
+            f"{path} does not hold the particles of body '{tensor}' ({reason(error, path)}): identify again"
         ) from error
     if particles.ndim != 2 or particles.shape[1] != 3 or not len(particles) or particles.dtype.kind != "f":
         raise InputError(f"{path}: '{tensor}' of shape {particles.shape} must be positions (Q, 3) [m]")
