@@ -36,9 +36,9 @@ class NonFiniteError(MasivError):
 
 _GIVEN = {
     errno.ENOENT: "give a path that can exist",
-    errno.ENOTDIR: "a file stands where a folder is needed: give another path",
+    errno.ENOTDIR: "a file stands where a folder must be: give another path",
     errno.EISDIR: "it is a folder: give the path of a file",
-    errno.EEXIST: "it exists already: give another path",
+    errno.EEXIST: "give another path",
     errno.ENOTEMPTY: "it holds something already: give another path",
     errno.ENAMETOOLONG: "give a shorter name",
     errno.EROFS: "the disk is read-only: give a path on another one",
@@ -53,13 +53,15 @@ _FAILED = {
     errno.EFBIG: "the file is larger than the system allows here: give a path on another disk",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
 }
+_LONGEST_NAME = 200
+"""Characters of a path in a message."""
 
 
 def of_system(error: OSError | MemoryError) -> MasivError:
     """An error of the operating system as one sentence: InputError if a path that was given causes it."""
     if isinstance(error, MemoryError):
         return MasivError(f"out of memory ({str(error) or 'no detail'}): use fewer particles, frames or pixels")
-    where = "" if error.filename is None else f"{error.filename}: "
+    where = "" if error.filename is None else f"{str(error.filename)[:_LONGEST_NAME]}: "
     what = error.strerror or " ".join(str(error).split()) or type(error).__name__
     if error.errno in _GIVEN:
         return InputError(f"{where}{what}: {_GIVEN[error.errno]}")

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from masiv.errors import InputError, MasivError
+from masiv.errors import InputError
 
 if TYPE_CHECKING:
     import torch
@@ -49,10 +49,9 @@ def atomic(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except BaseException as error:
         _remove(temporary)
-        if isinstance(error, (OSError, MasivError)) or not isinstance(error, Exception):
-            raise
-        # Libraries in other languages have errors of their own for a disk that is full.
-        raise MasivError(f"cannot write {path}: {' '.join(str(error).split())[:160]}") from error
+        if isinstance(error, OSError):
+            error.filename = str(path)  # not the temporary name, or none at all
+        raise
 
 
 def _remove(path: Path) -> None:
@@ -131,14 +130,13 @@ def write_safetensors(
     path: Path, tensors: Mapping[str, torch.Tensor | np.ndarray], metadata: dict[str, str] | None = None
 ) -> None:
     """Write ``tensors`` as safetensors, with text ``metadata`` and a digest in the header."""
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     arrays = {
         name: np.ascontiguousarray(value if isinstance(value, np.ndarray) else value.detach().cpu().numpy())
         for name, value in tensors.items()
     }
-    with atomic(path) as temporary:
-        save_file(arrays, temporary, {**(metadata or {}), DIGEST: _digest(arrays)})
+    write_bytes(path, save(arrays, {**(metadata or {}), DIGEST: _digest(arrays)}))
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:

@@ -71,11 +71,13 @@ def first_frame_problems(scene: Scene) -> list[str]:
 
 
 def _looking_away(views: list[Silhouette]) -> list[Silhouette]:
-    """Those of ``views`` behind which the lines through the middles of the masks meet."""
-    if len(views) < 2:
+    """Those of ``views`` behind which the lines through the middles of the masks meet: less than half of them, and of
+    three or more, since the lines of two opposite views meet anywhere."""
+    if len(views) < 3:
         return []
     middle = nearest_to_rays(views)
-    return [view for view in views if view.camera.project(middle[None])[1][0] <= 0]
+    away = [view for view in views if view.camera.project(middle[None])[1][0] <= 0]
+    return away if 2 * len(away) < len(views) else []
 
 
 def _size_and_ground(scene: Scene, points: np.ndarray) -> list[str]:

@@ -88,6 +88,8 @@ def _entries(folder: Path, listing: Path) -> list[_Entry]:
         row = mapping(row, where)
         name, time = text(row, "file_path", where), number(row, "time", where)
         intrinsics = array(row, "intrinsic", ((3, 3),), where)
+        if min(np.diag(intrinsics)) <= 0:
+            raise InputError(f"{where}: 'intrinsic' needs positive focal lengths")
         match = PICTURE.match(Path(name).name)
         if match is None:
             raise InputError(f"{where}: {quoted(name)} does not read as …_VIEW_FRAME.png")

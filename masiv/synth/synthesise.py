@@ -40,8 +40,10 @@ def synthesise(spec: SynthSpec, out: Path, *, progress: Progress = silent) -> No
         if out.exists():
             out.rmdir()
         os.replace(draft, out)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(draft, ignore_errors=True)
+        if isinstance(error, OSError):
+            error.filename = str(out)  # not the temporary name, or none at all
         raise
 
 

@@ -109,7 +109,7 @@ def read_c3d(path: Path) -> Table:
             first, last = int(reader.first_frame), int(reader.last_frame)
             frames = [np.array(points, np.float64) for _, points, _ in reader.read_frames()]
     except Exception as error:  # the library raises what it likes for a damaged file
-        raise InputError(f"{path} is damaged or no C3D file: {shortened(error)}") from error
+        raise InputError(f"{path} is not a C3D file that can be read: {shortened(error)}") from error
     if len(frames) < last - first + 1:  # the library stops with a warning
         raise InputError(
             f"{path} is cut short: its header says {last - first + 1} frames, there are {len(frames)}: copy it anew"
