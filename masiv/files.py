@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import torch
 
 DIGEST = "masiv_sha256"
-"""Key of the digest of the tensors in the metadata of a safetensors file, which has no check sum of its own."""
+"""Key of the digest in the metadata of a safetensors file, which has no check sum of its own."""
 
 
 def require_file(path: Path) -> Path:
@@ -136,7 +136,8 @@ def write_safetensors(
         name: np.ascontiguousarray(value if isinstance(value, np.ndarray) else value.detach().cpu().numpy())
         for name, value in tensors.items()
     }
-    write_bytes(path, save(arrays, {**(metadata or {}), DIGEST: _digest(arrays)}))
+    given = metadata or {}
+    write_bytes(path, save(arrays, {**given, DIGEST: _digest(arrays, given)}))
 
 
 def read_safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
@@ -152,7 +153,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]
         raise
     except Exception as error:
         raise InputError(f"{path} is damaged or no safetensors file ({' '.join(str(error).split())[:160]})") from error
-    if metadata.pop(DIGEST, None) not in (None, _digest(arrays)):
+    if metadata.pop(DIGEST, None) not in (None, _digest(arrays, metadata)):
         raise InputError(f"{path} is damaged: its numbers are not those that were written")
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -160,8 +161,8 @@ def read_safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]
     return arrays, metadata
 
 
-def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
+def _digest(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
     for name in sorted(arrays):
         array = arrays[name]
         digest.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())

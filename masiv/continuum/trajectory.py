@@ -98,8 +98,7 @@ class Trajectory:
             return cls(file["positions"], file["times"], spacing, volume, network, log_sd, mirror)
         except (InputError, KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
             raise InputError(
-                f"{path} is not a trajectory saved by masiv ({reason(error, path)}); delete it and run masiv trajectory "
-                "in a new folder"
+                f"{path} is not a trajectory saved by masiv ({reason(error, path)}): start a new run with --out"
             ) from error
 
 
