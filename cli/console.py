@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from masiv.errors import InputError, MasivError
+from masiv.errors import InputError, MasivError, of_system
 
 from .supervisor import interrupted_by
 
@@ -53,8 +53,9 @@ def command(function: Callable[..., tuple[dict[str, Any], str]]) -> Callable[...
 
 def _fail_with(error: Exception, as_json: bool) -> NoReturn:
     """Say what ``error`` means, and exit with its code."""
-    if isinstance(error, MasivError):
-        fail(str(error), BAD_INPUT if isinstance(error, InputError) else FAILED, as_json)
+    if isinstance(error, (MasivError, OSError, MemoryError)):
+        told = error if isinstance(error, MasivError) else of_system(error)
+        fail(str(told), BAD_INPUT if isinstance(told, InputError) else FAILED, as_json)
     import traceback
 
     traceback.print_exception(error)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from masiv.files import atomic
+from masiv.files import require_file, write_bytes
+
+FORMAT = 1
+"""Of the states: it changes when a stage keeps other things."""
 
 
 class Checkpoint:
@@ -22,12 +27,28 @@ class Checkpoint:
         self._last = time.monotonic()
 
     def load(self) -> dict[str, Any] | None:
-        """The last state that was saved, or None. Raises an error of torch if the file is damaged."""
+        """The last state that was saved, or None. A file that is damaged, or of another stage or version of masiv, is
+        removed with a warning: the stage begins anew."""
         if self.path is None or not self.path.exists():
             return None
         import torch
 
-        return torch.load(self.path, weights_only=True)
+        try:
+            file = torch.load(require_file(self.path), weights_only=True)
+            state, of = file["state"], file["of"]
+            if of == self._mark and isinstance(state, dict):
+                return state
+            reason = "is of another stage or version of masiv"
+        except Exception:  # zip, pickle and torch raise what they like for damaged data
+            reason = "is damaged"
+        warnings.warn(f"{self.path} {reason}: it is removed, and the stage begins anew", stacklevel=2)
+        self.path.unlink(missing_ok=True)
+        return None
+
+    @property
+    def _mark(self) -> list[str | int]:
+        """What a file must be of for its state to be understood."""
+        return ["" if self.path is None else self.path.stem, FORMAT]
 
     def maybe_save(self, make_state: Callable[[], dict[str, Any]]) -> None:
         """Save ``make_state()`` if the last save is more than ``every_s`` seconds ago."""
@@ -40,8 +61,9 @@ class Checkpoint:
             return
         import torch
 
-        with atomic(self.path) as temporary:
-            torch.save(state, temporary)
+        data = io.BytesIO()  # torch's own writer ends the process where a disk is full
+        torch.save({"of": self._mark, "state": state}, data)
+        write_bytes(self.path, data.getvalue())
         self._last = time.monotonic()
 
     def clear(self) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from masiv.continuum.config import TrajectoryConfig
 from masiv.errors import InputError
@@ -18,7 +18,7 @@ from masiv.refinement.config import REMOVED_KEYS as REFINE_REMOVED_KEYS
 from masiv.refinement.config import RENAMED_KEYS as REFINE_RENAMED_KEYS
 from masiv.refinement.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
-from masiv.strict import read_yaml, validated
+from masiv.strict import quoted, read_yaml, validated
 from masiv.tracks.config import TracksConfig
 
 RENAMED_KEYS = {
@@ -89,12 +89,29 @@ def load_config(
         merged["preset"] = preset
     for key, value in flags.items():
         if value is not None:
-            *sections, name = key.split(".")
-            nested: dict[str, Any] = {name: value}
-            for section in reversed(sections):
-                nested = {section: nested}
-            merged = _merged(merged, nested)
+            _check_flag(key, value)
+            merged = _merged(merged, _nested(key, value))
     return validated(Config, merged, "the command line" if path is None else str(path))
+
+
+def _check_flag(key: str, value: object) -> None:
+    """Raises InputError that names the option if ``value`` cannot be that of the nested ``key``."""
+    try:
+        Config.model_validate(_nested(key, value))
+    except ValidationError as error:
+        name, message = key.split(".")[-1], error.errors()[0]["msg"]
+        raise InputError(
+            f"--{name.replace('_', '-')} {quoted(value)}: {message[:1].lower() + message[1:]} (see --help)"
+        ) from error
+
+
+def _nested(key: str, value: object) -> dict[str, Any]:
+    """A mapping in which ``value`` has the dotted ``key``."""
+    *sections, name = key.split(".")
+    nested: dict[str, Any] = {name: value}
+    for section in reversed(sections):
+        nested = {section: nested}
+    return nested
 
 
 def renamed_keys(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -108,8 +125,8 @@ def renamed_keys(config: Mapping[str, Any]) -> dict[str, Any]:
     for name, renamed in RENAMED_VALUES.items():
         section, key = name.split(".")
         values = result.get(section)
-        if isinstance(values, dict) and values.get(key) in renamed:
-            values[key] = renamed[values[key]]
+        if isinstance(values, dict) and isinstance(value := values.get(key), str) and value in renamed:
+            values[key] = renamed[value]
     return result
 
 
@@ -127,7 +144,7 @@ def without_removed_keys(config: Mapping[str, Any]) -> dict[str, Any]:
 def preset_overlay(name: str) -> dict[str, Any]:
     """The keys that preset ``name`` sets. Raises InputError for an unknown name."""
     if name not in get_args(Preset):
-        raise InputError(f"unknown preset '{name}': use one of {', '.join(get_args(Preset))}")
+        raise InputError(f"unknown preset '{name}' (--preset): use one of {', '.join(get_args(Preset))}")
     text = files("masiv.presets").joinpath(f"{name}.yaml").read_text(encoding="utf-8")
     return {"preset": name, **(yaml.safe_load(text) or {})}
 

@@ -1,10 +1,12 @@
 """Files that are written completely or not at all: under a temporary name in the same folder, which is then renamed.
 
-A writer that fails leaves the target as it was and no temporary file. All functions create missing folders.
+A writer that fails leaves the target as it was and no temporary file. All functions that write create missing folders.
+Readers raise InputError for whatever is not what the writer wrote.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -16,8 +18,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from masiv.errors import InputError
+
 if TYPE_CHECKING:
     import torch
+
+DIGEST = "masiv_sha256"
+"""Key of the digest in the metadata of a safetensors file, which has no check sum of its own."""
+
+
+def require_file(path: Path) -> Path:
+    """``path``. Raises InputError if it is missing, or no regular file: reading a pipe or a device may never end."""
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "is not a regular file" if path.exists() else "is missing"
+        raise InputError(f"{path} {what}: give the path of a file")
+    return path
 
 
 @contextmanager
@@ -33,8 +48,10 @@ def atomic(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        _remove(temporary)
+        if isinstance(error, OSError):
+            error.filename = str(path)  # not the temporary name, or none at all
         raise
 
 
@@ -43,6 +60,13 @@ def remove_temporary(folder: Path) -> None:
     for path in folder.rglob("*.tmp*"):
         if re.search(r"\.\d+\.tmp(\.\w+)?$", path.name):
             path.unlink(missing_ok=True)
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:  # the error that follows says why
+        pass
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -75,12 +99,82 @@ def write_npz(path: Path, /, *, compressed: bool = True, **arrays: Any) -> None:
         (np.savez_compressed if compressed else np.savez)(temporary, **arrays)
 
 
-def write_safetensors(path: Path, tensors: Mapping[str, torch.Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Write ``tensors`` as safetensors, with text ``metadata`` in the header."""
-    from safetensors.torch import save_file
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a NumPy archive by name. Raises InputError for a file that is damaged or something else."""
+    try:
+        with np.load(require_file(path), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except InputError:
+        raise
+    except Exception as error:  # zip, zlib and NumPy raise what they like for damaged data
+        raise InputError(f"{path} is damaged or no NumPy archive ({' '.join(str(error).split())[:160]})") from error
 
-    with atomic(path) as temporary:
-        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, temporary, metadata)
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array of real numbers in a .npy file. Raises InputError for a file that is damaged or something else."""
+    try:
+        array = np.load(require_file(path), allow_pickle=False)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "uif":
+            raise ValueError(f"it holds {getattr(array, 'dtype', 'several arrays')}")
+    except InputError:
+        raise
+    except Exception as error:  # also SyntaxError and MemoryError, of a header that says anything
+        raise InputError(f"{path} is not an array of numbers ({' '.join(str(error).split())[:160]})") from error
+    return array
+
+
+def check_motion(positions: np.ndarray, times: np.ndarray) -> None:
+    """Raises ValueError unless ``positions`` (T, Q, 3) of T ≥ 1 frames and ``times`` (T,) are finite numbers, and the
+    times ascend."""
+    if positions.ndim != 3 or positions.shape[2] != 3 or 0 in positions.shape or times.shape != positions.shape[:1]:
+        raise ValueError(f"positions have shape {positions.shape}, times {times.shape}")
+    if {positions.dtype.kind, times.dtype.kind} != {"f"}:
+        raise ValueError(f"positions are {positions.dtype}, times {times.dtype}")
+    if not (np.isfinite(positions).all() and np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        raise ValueError("a position or a time is not finite, or times do not ascend")
+
+
+def write_safetensors(
+    path: Path, tensors: Mapping[str, torch.Tensor | np.ndarray], metadata: dict[str, str] | None = None
+) -> None:
+    """Write ``tensors`` as safetensors, with text ``metadata`` and a digest in the header."""
+    from safetensors.numpy import save
+
+    arrays = {
+        name: np.ascontiguousarray(value if isinstance(value, np.ndarray) else value.detach().cpu().numpy())
+        for name, value in tensors.items()
+    }
+    given = metadata or {}
+    write_bytes(path, save(arrays, {**given, DIGEST: _digest(arrays, given)}))
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Tensors by name, and the metadata. Raises InputError if the file is damaged, which its digest tells, or has a
+    number that is not finite."""
+    from safetensors import safe_open
+
+    try:
+        with safe_open(require_file(path), framework="np") as file:
+            metadata = dict(file.metadata() or {})
+            arrays = {name: file.get_tensor(name) for name in file.keys()}
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path} is damaged or no safetensors file ({' '.join(str(error).split())[:160]})") from error
+    if metadata.pop(DIGEST, None) not in (None, _digest(arrays, metadata)):
+        raise InputError(f"{path} is damaged: its numbers are not those that were written")
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise InputError(f"{path}: '{name}' has a number that is not finite")
+    return arrays, metadata
+
+
+def _digest(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
+    return digest.hexdigest()
 
 
 def plain(value: Any) -> Any:

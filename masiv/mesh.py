@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from masiv.errors import InputError
+from masiv.strict import shortened
 
 if TYPE_CHECKING:
     import trimesh
 
 FORMATS = (".stl", ".obj", ".ply")
 """The others that trimesh reads are scenes or archives, whose readers may open further files."""
+
+_LARGEST = 1e12
+"""Coordinate in the unit of a file: above it, volumes lose their digits."""
 
 
 def read_mesh(path: Path) -> trimesh.Trimesh:
@@ -26,11 +30,14 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path} is no STL, OBJ or PLY file: convert the mesh to one of these")
     if not path.is_file():
-        raise InputError(f"{path} does not exist: give the path of a mesh")
+        raise InputError(f"{path} does not exist or is not a regular file: give the path of a mesh")
     try:
         mesh = trimesh.load(path, force="mesh")
+        corners = np.asarray(mesh.vertices, np.float64) if isinstance(mesh, trimesh.Trimesh) else np.zeros((0, 3))
     except Exception as error:  # its readers raise what they like
-        raise InputError(f"{path} is not a triangle mesh that can be read: {error}") from error
+        raise InputError(f"{path} is not a triangle mesh that can be read: {shortened(error)}") from error
+    if not (np.isfinite(corners).all() and np.abs(corners).max(initial=0) < _LARGEST):
+        raise InputError(f"{path} has a coordinate that is not finite or above {_LARGEST:g}: repair the mesh")
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not mesh.is_watertight:
         raise InputError(f"{path} is not watertight, so it has no inside: close its holes first")
     return mesh

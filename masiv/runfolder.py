@@ -22,10 +22,10 @@ import numpy as np
 
 from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
-from masiv.files import remove_temporary, write_yaml
+from masiv.files import check_motion, read_npz, remove_temporary, write_yaml
 from masiv.folder_lock import locked
 from masiv.scene.scene import Ground
-from masiv.strict import read_yaml
+from masiv.strict import read_yaml, reason
 
 SCHEMA = 2
 """Format of the folder. In schema 1, paths of the scene and of other runs were absolute; it is read, too."""
@@ -76,7 +76,9 @@ class RunFolder:
                 f"{path / 'run.yaml'} was not written by this version of masiv: start a new run with --out"
             )
         from masiv.config import renamed_keys
+        from masiv.run_record import check_record
 
+        check_record(record, path / "run.yaml")
         record["config"] = renamed_keys(record["config"])
         return cls(path, _with_paths(record, lambda other: str((path.resolve() / other).resolve())))
 
@@ -279,10 +281,11 @@ def refuse_run(folder: Path, option: str) -> None:
 def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, Q, 3) float32 [m, world] and times (T,) [s] of a rollout.npz. Raises InputError."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return file["positions"], file["times"]
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"{path} is not a rollout saved by masiv ({error})") from error
+        file = read_npz(path)
+        check_motion(file["positions"], file["times"])
+    except (InputError, KeyError, ValueError) as error:
+        raise InputError(f"{path} is not a rollout saved by masiv ({reason(error, path)})") from error
+    return file["positions"], file["times"]
 
 
 def _is_empty(folder: Path) -> bool:

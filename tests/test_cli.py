@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import resource
+import shutil
 import subprocess
 import sys
 
@@ -141,16 +143,62 @@ def test_bad_input_is_one_sentence_and_exit_code_2(masiv, scene, tmp_path, argum
     assert not (tmp_path / "run").exists()
 
 
+def moved_apart(scene, target, frame):
+    """A copy of the scene in which no volume projects on the masks of both cameras at ``frame``."""
+    shutil.copytree(scene, target)
+    for view, rows in ((0, -6), (1, 8)):
+        for kind in "rm":
+            path = target / f"data/{kind}_{view}_{frame}.png"
+            cv2.imwrite(str(path), np.roll(cv2.imread(str(path)), rows, axis=0))
+    return target
+
+
 def test_work_that_fails_is_exit_code_1(masiv, scene, tmp_path):
-    """The two cameras' masks are moved apart, so that no volume projects on both."""
-    broken = tmp_path / "scene"
-    broken.mkdir()
-    (broken / "data").mkdir()
-    for path in scene.glob("data/*.png"):
-        image = cv2.imread(str(path))
-        image = np.roll(image, 18 if "_1_" in path.name else -6, axis=0)
-        cv2.imwrite(str(broken / "data" / path.name), image)
-    (broken / "all_data.json").write_text((scene / "all_data.json").read_text())
+    broken = moved_apart(scene, tmp_path / "scene", 1)
     result = masiv("reconstruct", broken, "--out", tmp_path / "run", "--json")
     assert result.returncode == 1, result.stderr
-    assert "frame 0" in json.loads(result.stdout)["error"]
+    assert "frame 1" in json.loads(result.stdout)["error"]
+
+
+def test_a_first_frame_without_an_object_is_bad_input(masiv, scene, tmp_path):
+    broken = moved_apart(scene, tmp_path / "scene", 0)
+    result = masiv("reconstruct", broken, "--out", tmp_path / "run", "--json")
+    assert result.returncode == 2, result.stderr
+    assert "no volume" in json.loads(result.stdout)["error"]
+    assert not (tmp_path / "run").exists()
+    assert any(
+        "no volume" in p for p in json.loads(masiv("inspect", broken, "--json", cwd=tmp_path).stdout)["problems"]
+    )
+
+
+def test_a_file_that_the_system_cannot_hold_is_one_sentence_and_exit_code_1(masiv, scene, tmp_path):
+    """As on a full disk, with a limit of 1 kB a file in its place."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        result = masiv("inspect", scene, "--out", tmp_path / "sheet.png")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert result.returncode == 1
+    assert result.stderr.startswith(f"error: {tmp_path / 'sheet.png'}: File too large")
+    assert len(result.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["taken/x.png", "taken", "x" * 300])
+def test_an_impossible_place_is_one_sentence_and_exit_code_2(masiv, scene, tmp_path, name):
+    (tmp_path / "taken").mkdir() if name == "taken" else (tmp_path / "taken").write_text("a file")
+    result = masiv("inspect", scene, "--out", tmp_path / name)
+    assert result.returncode == 2, result.stderr
+    assert str(tmp_path / name.split("/")[0])[:150] in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["taken"]
+
+
+def test_a_wrong_option_is_named(masiv, scene, tmp_path):
+    (tmp_path / "settings.yaml").write_text("seed: 3")
+    for option, value in (("--law", "typo"), ("--geometry-loss", "typo"), ("--arch", "typo"), ("--seed", "-1")):
+        result = masiv("identify", scene, "--config", tmp_path / "settings.yaml", option, value, cwd=tmp_path)
+        assert result.returncode == 2, result.stderr
+        assert option in result.stderr
+        assert "settings.yaml" not in result.stderr

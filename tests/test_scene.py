@@ -210,7 +210,7 @@ def test_bad_scene_yaml_is_one_clear_sentence(folder, text, message):
     ("edit", "message"),
     [
         (lambda d: d[1].pop("c2w"), "entry 1"),
-        (lambda d: d[1]["c2w"][0].__setitem__(3, float("nan")), "not finite"),
+        (lambda d: d[1]["c2w"][0].__setitem__(3, float("nan")), "finite numbers"),
         (lambda d: d[1].update(c2w=(2 * np.array(d[1]["c2w"])).tolist()), "not a rotation"),
         (lambda d: d[2]["c2w"][0].__setitem__(3, 9.0), "moves between"),
         (lambda d: d[2].update(time=0.09), "not frame 1 at 24 fps"),

@@ -21,7 +21,7 @@ from masiv.continuum.density_field import even_points
 from masiv.continuum.fill import FilledVolume, density_field, fill_later_frame, hull_volume
 from masiv.continuum.finetune import fine_tune
 from masiv.errors import InputError, MasivError
-from masiv.files import write_npz
+from masiv.files import check_motion, read_npz, write_npz
 from masiv.hull.carve import visual_hull
 from masiv.hull.silhouette import silhouettes
 from masiv.hull.symmetry import MirrorPlane, contradicting, mirror_plane, symmetric_hull
@@ -31,6 +31,7 @@ from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
+from masiv.strict import reason
 
 _CHUNK = 8
 """Times that are evaluated together: limits the memory."""
@@ -80,22 +81,25 @@ class Trajectory:
     def load(cls, path: Path) -> Trajectory:
         """Read what ``save`` wrote. Raises InputError if ``path`` is missing or another file."""
         try:
-            with np.load(path, allow_pickle=False) as file:
-                weights = {
-                    n.removeprefix("network/"): torch.from_numpy(file[n]) for n in file if n.startswith("network/")
-                }
-                settings = json.loads(str(file["network_settings"]))
-                network = DeformationNetwork(
-                    centre=weights["centre"], base_motion=weights["base_motion"], **settings
-                ).requires_grad_(False)
-                network.load_state_dict(weights)
-                log_sd = float(file["volume_log_sd"]) if "volume_log_sd" in file else math.nan
-                spacing, volume = float(file["spacing"]), float(file["volume"])
-                plane = file["mirror"] if "mirror" in file else None
-                mirror = None if plane is None else MirrorPlane(plane[:3], float(plane[3]))
-                return cls(file["positions"], file["times"], spacing, volume, network, log_sd, mirror)
-        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-            raise InputError(f"{path} is not a trajectory saved by masiv ({error}); run masiv trajectory") from error
+            file = read_npz(path)
+            weights = {n.removeprefix("network/"): torch.from_numpy(file[n]) for n in file if n.startswith("network/")}
+            settings = json.loads(str(file["network_settings"]))
+            network = DeformationNetwork(
+                centre=weights["centre"], base_motion=weights["base_motion"], **settings
+            ).requires_grad_(False)
+            network.load_state_dict(weights)
+            log_sd = float(file["volume_log_sd"]) if "volume_log_sd" in file else math.nan
+            spacing, volume = float(file["spacing"]), float(file["volume"])
+            plane = file.get("mirror")
+            mirror = None if plane is None else MirrorPlane(plane[:3], float(plane[3]))
+            check_motion(file["positions"], file["times"])
+            if not (0 < spacing < math.inf and 0 < volume < math.inf):
+                raise ValueError(f"spacing {spacing:g} m, volume {volume:g} m³")
+            return cls(file["positions"], file["times"], spacing, volume, network, log_sd, mirror)
+        except (InputError, KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
+            raise InputError(
+                f"{path} is not a trajectory saved by masiv ({reason(error, path)}): start a new run with --out"
+            ) from error
 
 
 def estimate_trajectory(

@@ -133,7 +133,7 @@ def _cell_centres(lower: np.ndarray, spacing: float, counts: np.ndarray) -> np.n
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _nearest_to_rays(seen: list[Silhouette]) -> np.ndarray:
+def nearest_to_rays(seen: list[Silhouette]) -> np.ndarray:
     """The point (3,) [m] with the least sum of squared distances to the rays through the centroids of the masks."""
     normal_matrix, right_side = np.zeros((3, 3)), np.zeros(3)
     for view in seen:
@@ -150,7 +150,7 @@ def _nearest_to_rays(seen: list[Silhouette]) -> np.ndarray:
 def _middle(seen: list[Silhouette], depths: tuple[DepthView, ...]) -> np.ndarray:
     """A point (3,) [m] in the middle of the object: of its rays, or of its depth if one view alone shows it."""
     if len(seen) > 1:
-        return _nearest_to_rays(seen)
+        return nearest_to_rays(seen)
     points = seen_points(depths)
     return (points.min(axis=0) + points.max(axis=0)) / 2
 
@@ -165,7 +165,7 @@ def _radius_around(view: Silhouette, centre: np.ndarray) -> float:
 
 def _no_volume(views, seen: list[Silhouette], scene: Scene, frame: int) -> str:
     """The error message. It names the view that contradicts the others most: without it the volume is largest."""
-    centre = _nearest_to_rays(seen)
+    centre = nearest_to_rays(seen)
     radius = max(_radius_around(view, centre) for view in seen)
     spacing = 2 * radius / _COARSE
     grid = _cell_centres(centre - radius, spacing, np.full(3, _COARSE))

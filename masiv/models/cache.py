@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from masiv.files import write_npz
+from masiv.errors import InputError
+from masiv.files import read_npz, write_npz
 from masiv.observations.identity import content_hash, source_digest
 
 COMPUTING = ("kernels", "mpm", "materials", "effects", "models")
@@ -44,10 +46,8 @@ class RolloutCache:
         if name in self._kept:
             return self._kept[name]
         file = None if self.folder is None else self.folder / f"{content_hash((name, code_digest()))[:24]}.npz"
-        if file is not None and file.is_file():
-            with np.load(file, allow_pickle=False) as saved:
-                found = {key: saved[key] for key in saved.files}
-        else:
+        found = None if file is None or not file.is_file() else _read(file)
+        if found is None:
             found = compute()
             if file is not None:
                 write_npz(file, compressed=False, **found)
@@ -55,3 +55,11 @@ class RolloutCache:
             self._kept.pop(next(iter(self._kept)))
         self._kept[name] = found
         return found
+
+
+def _read(file: Path) -> Arrays | None:
+    try:
+        return read_npz(file)
+    except InputError:
+        warnings.warn(f"{file}, a rollout that was kept, is damaged: it is simulated again", stacklevel=3)
+        return None

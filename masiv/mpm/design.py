@@ -94,7 +94,8 @@ def substeps_per_frame(
         if own <= limit:
             asks = f"{' and '.join(demand.effects)} as strong as this (the law alone would need {own})"
         else:
-            asks = f"the law (wave modulus {wave_modulus:.3g} Pa)"
+            waves = math.sqrt(STIFFENING * max(wave_modulus, 0.0) / density)
+            asks = f"a speed of {speed:.3g} m/s" if speed > waves else f"the law (wave modulus {wave_modulus:.3g} Pa)"
         raise MasivError(
             f"{asks} needs {own if own > limit else count} substeps a frame, more than "
             f"simulator.max_substeps_per_frame = {limit}: raise it, or use fewer particles"

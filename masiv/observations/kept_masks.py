@@ -8,8 +8,6 @@ D is a digest of cameras and views, which differ between stages. Masks are float
 from __future__ import annotations
 
 import warnings
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from masiv.files import write_npz
+from masiv.errors import InputError
+from masiv.files import read_npz, write_npz
 from masiv.observations.identity import content_hash, source_digest
 from masiv.scene.frame_cache import Frame, FrameCache
 from masiv.scene.scene import CorrectMasks, MaskedReader, Scene
@@ -40,11 +39,11 @@ class KeptMasks:
         if not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as file:
-                if str(file["key"]) == self.key:
-                    return {int(view): file[view] for view in file if view != "key"}
+            file = read_npz(path)
+            if str(file.pop("key")) == self.key:
+                return {int(view): mask for view, mask in file.items()}
             reason = "is of other pictures, settings or code"
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        except (InputError, ValueError, KeyError):
             reason = "is damaged"
         warnings.warn(f"what {self.folder} keeps of masks {reason}: they are estimated again", stacklevel=2)
         return None

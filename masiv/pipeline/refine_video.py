@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,7 @@ from masiv.files import write_json
 from masiv.pipeline import stages
 from masiv.pipeline.requests import RefineRequest, Summary
 from masiv.progress import Progress
-from masiv.runfolder import RunFolder, load_motion
+from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -133,22 +132,18 @@ def _delete_artefacts_of_twin(run: RunFolder) -> None:
 def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: Progress) -> None:
     """Write report.html, and before it what the run lacks of rollout, material.json and metrics.json."""
     from masiv.report.numbers import material_numbers, run_numbers
-    from masiv.report.sections.material import MATERIAL
     from masiv.report.video import write_report
-    from masiv.simulation.simulate import simulate
     from masiv.twin import Twin
 
     progress("report", 0, 1)
     twin, trajectory = Twin.load(run.path), stages.load_trajectory(run)
-    if not run.rollout.is_file():
-        simulate(twin, frames=scene.frame_count, fps=scene.fps, progress=progress).save(run.rollout)
-    rollout, _ = load_motion(run.rollout)
-    if not (run.path / MATERIAL).is_file():
+    rollout = stages.rollout_of(run, twin, progress)
+    if not stages.has_material(run):
         stages.describe_material(run, twin, progress)
-    if not run.metrics.is_file():
-        numbers = run_numbers(run, scene, dynamic, trajectory, rollout)
-        write_json(run.metrics, numbers | material_numbers(run))
-    numbers = json.loads(run.metrics.read_text(encoding="utf-8"))
+    numbers = stages.read_metrics(run)
+    if numbers is None:
+        numbers = run_numbers(run, scene, dynamic, trajectory, rollout) | material_numbers(run)
+        write_json(run.metrics, numbers)
     write_report(run, scene, dynamic, trajectory, twin, rollout, numbers)
     progress("report", 1, 1)
 

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from masiv import runtime
 from masiv.config import Config
 from masiv.errors import InputError
+from masiv.hull.first_frame import require_first_frame
 from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
 from masiv.progress import Progress, silent
 from masiv.report.history import logged
-from masiv.report.sections.material import MATERIAL
-from masiv.runfolder import RunFolder
+from masiv.report.sections.material import MATERIAL, read_material
+from masiv.runfolder import RunFolder, load_motion
 from masiv.scene.calibration import Calibration
+from masiv.scene.listing import mapping
 from masiv.scene.scene import Scene
+from masiv.strict import read_json
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from masiv.continuum.trajectory import Trajectory
     from masiv.splat.dynamic import DynamicGaussians
     from masiv.twin import Twin
@@ -66,6 +72,8 @@ def ensure_gaussians(run: RunFolder, config: Config, scene: Scene, progress: Pro
         return load_gaussians(run)
     from masiv.splat.reconstruct import reconstruct
 
+    if scene.masks_estimated:
+        require_first_frame(training_scene(run, scene))
     with run.stage("reconstruct") as checkpoint:
         dynamic = reconstruct(
             training_scene(run, scene),
@@ -187,13 +195,53 @@ def material_description(run: RunFolder, config: Config, twin: Twin) -> Iterator
     """Write material.json, if it is missing, in a second process while the body of this context runs."""
     from masiv.workers import Workers, process_count, unwrap
 
-    if (run.path / MATERIAL).is_file():
+    if has_material(run):
         yield
         return
     with Workers(min(2, process_count(config.identify.processes)), "identify.processes") as workers:
         wait = workers.submit(describe_material, (run, twin))
         yield
         unwrap(wait())
+
+
+def has_material(run: RunFolder) -> bool:
+    """Whether the run has a material.json; one that is damaged is removed, with a warning."""
+    try:
+        return read_material(run.path) is not None
+    except InputError:
+        warnings.warn(f"{run.path / MATERIAL} is damaged: it is made again", stacklevel=3)
+        (run.path / MATERIAL).unlink()
+        return False
+
+
+def read_metrics(run: RunFolder) -> dict[str, Any] | None:
+    """metrics.json of the run; None if it is missing, or, with a warning, damaged."""
+    if not run.metrics.is_file():
+        return None
+    try:
+        return dict(mapping(read_json(run.metrics), str(run.metrics)))
+    except InputError:
+        warnings.warn(f"{run.metrics} is damaged: it is made again", stacklevel=2)
+        return None
+
+
+def rollout_of(run: RunFolder, twin: Twin, progress: Progress) -> np.ndarray:
+    """Positions (T, Q, 3) [m] of the run's rollout.npz; simulated again, with a warning, if the file is damaged, and
+    without one if it is missing."""
+    from masiv.simulation.simulate import simulate
+
+    if run.rollout.is_file():
+        try:
+            positions, _ = load_motion(run.rollout)
+            if len(positions) == run.frame_count:
+                return positions
+            reason = f"has {len(positions)} of {run.frame_count} frames"
+        except InputError:
+            reason = "is damaged"
+        warnings.warn(f"{run.rollout} {reason}: the twin is simulated again", stacklevel=2)
+    rollout = simulate(twin, frames=run.frame_count, progress=progress)
+    rollout.save(run.rollout)
+    return rollout.positions
 
 
 def describe_material(run: RunFolder, twin: Twin, progress: Progress = silent) -> None:

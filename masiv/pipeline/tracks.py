@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, Simu
 from masiv.pipeline.run import Run, settings
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder, refuse_run
-from masiv.strict import read_yaml
+from masiv.strict import read_json, read_yaml
 from masiv.tracks.read import read_tracks
 from masiv.tracks.tracks import Tracks
 
@@ -250,7 +249,7 @@ class TracksRun(Run):
             self.folder.metrics, {"runs": errors, "unit": "mm", "what": "root mean square distance of the points"}
         )
         files = [self.path / f"{refine_stem(c, self._conditions[0])}.json" for c in self._conditions]
-        refined = [with_scopes(json.loads(p.read_text(encoding="utf-8"))) for p in files if p.is_file()]
+        refined = [with_scopes(read_json(p)) for p in files if p.is_file()]
         write_report(self.folder.report, self.tracks, twin, errors, curves, refined)
         return errors
 

@@ -11,6 +11,7 @@ from typing import Any
 from masiv.config import Config
 from masiv.errors import InputError
 from masiv.files import write_json
+from masiv.hull.first_frame import require_first_frame
 from masiv.observations.identity import identity
 from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
@@ -65,7 +66,9 @@ class VideoRun(Run):
         if fit_frames is None:
             fit_frames = existing.fit_frames if existing else read.fit_frames or read.frame_count
         cameras = tuple(sorted(set(request.holdout_camera))) or (existing.holdout_cameras if existing else ())
-        read.restricted(fit_frames, cameras)
+        visible = read.restricted(fit_frames, cameras)
+        if existing is None and not read.masks_estimated:  # those are estimated once, when the folder can keep them
+            require_first_frame(visible)
         asked = Request(config.model_dump(mode="json"), scene, identity(read), fit_frames, cameras)
         folder = RunFolder.create_or_resume(out, asked)
         return cls(folder, config, scene, with_kept_masks(read, folder.masks))
@@ -224,15 +227,17 @@ class VideoRun(Run):
         scene = self.scene if self.scene_path.exists() else None
         self.start()
         from masiv.report.numbers import evaluation_numbers, table
-        from masiv.runfolder import load_motion
         from masiv.twin import Twin
 
         dynamic, trajectory = stages.load_gaussians(self.folder), stages.load_trajectory(self.folder)
-        twin, rollout = None, None
-        if self.folder.done("identify") and self.folder.rollout.is_file():
-            twin, (rollout, _) = Twin.load(self.path), load_motion(self.folder.rollout)
-        numbers = evaluation_numbers(self.folder, scene, dynamic, trajectory, twin, rollout, truth, progress=progress)
         with self.folder.locked():
+            twin, rollout = None, None
+            if self.folder.done("identify") and self.folder.rollout.is_file():
+                twin = Twin.load(self.path)
+                rollout = stages.rollout_of(self.folder, twin, progress)
+            numbers = evaluation_numbers(
+                self.folder, scene, dynamic, trajectory, twin, rollout, truth, progress=progress
+            )
             write_json(self.folder.evaluation, numbers)
         text = f"{table(numbers)}\n{self.folder.evaluation}"
         if scene is None:

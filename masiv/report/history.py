@@ -9,6 +9,7 @@ from pathlib import Path
 from masiv.progress import Progress
 
 NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+COUNT = re.compile(r"[0-9]{1,18}")
 POINTS_PER_STAGE = 200
 
 
@@ -28,15 +29,15 @@ def curves(path: Path) -> dict[str, tuple[list[int], list[float], str]]:
     """For each stage that reported a number: iterations, values, and what the first number of its notes is.
 
     A resumed stage repeats iterations; the last report of each counts. A stage whose reports are of different things,
-    such as candidates one after the other, has no curve.
+    such as candidates one after the other, has no curve. A line that is no report does not count.
     """
     if not path.is_file():
         return {}
     found: dict[str, dict[int, float]] = {}
     labels: dict[str, set[str]] = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.reader(file):
-            note = row[3].split(",")[0] if len(row) == 4 else ""
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        for row in csv.reader(line.replace("\0", "") for line in file):
+            note = row[3].split(",")[0] if len(row) == 4 and COUNT.fullmatch(row[1]) else ""
             match = NUMBER.search(note)
             if match is not None:
                 found.setdefault(row[0], {})[int(row[1])] = float(match[0])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from masiv.calibration.consistency import odd_camera, silhouette_consistency
+from masiv.hull.first_frame import first_frame_problems
 from masiv.hull.mask_quality import mask_quality
 from masiv.observations.identity import identity
 from masiv.report.contact_sheet import write_contact_sheet
@@ -31,7 +32,7 @@ def inspection(read: Scene | Tracks, picture: Path) -> tuple[dict[str, Any], str
     for view, agrees, doubt in zip(quality.views, quality.agreement, quality.doubt, strict=True):
         summary["cameras"][view]["mask_agreement"] = float(agrees) if np.isfinite(agrees) else None
         summary["cameras"][view]["mask_doubt"] = float(doubt) if np.isfinite(doubt) else None
-    summary["problems"] += quality.problems()
+    summary["problems"] += [*first_frame_problems(read), *quality.problems()]
     odd = odd_camera(read, agreement)
     summary["problems"] += [] if odd is None else [odd]
     write_contact_sheet(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,17 @@ import numpy as np
 
 from masiv import metrics
 from masiv.errors import InputError
+from masiv.files import read_npy
 from masiv.report.draw import draw, on_black
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.subdivide import merge_subparticles
 from masiv.splat.gaussians import Gaussians
 
+MIN_TRUE_PARTICLES = 8
+"""As many as the neighbours from which a true displacement is interpolated."""
+_OTHER_SIZE = 5.0
+"""Ratio of sizes from which on two bodies are not one: a reconstruction is within tens of per cent, and the next unit
+of length is a factor of ten away."""
 UNITS = {
     "psnr_db": "dB, whole picture, object on black",
     "psnr_box_db": "dB, box of the observed mask, object on black",
@@ -105,20 +112,47 @@ def agreement(rollout: np.ndarray, trajectory: np.ndarray) -> dict[str, Any]:
 
 def read_truth(folder: Path, frames: int) -> np.ndarray:
     """``folder``/particles_F.npy (P, 3) [m] for F = 0…, at most ``frames`` of them -> (T, P, 3). Raises InputError."""
-    positions: list[np.ndarray] = []
-    while len(positions) < frames and (path := folder / f"particles_{len(positions)}.npy").is_file():
-        try:
-            points = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path} is not an array of points ({error})") from error
-        if points.ndim != 2 or points.shape[1] != 3 or (positions and points.shape != positions[0].shape):
-            raise InputError(f"{path} has shape {points.shape}: every frame needs the same particles, (P, 3)")
-        positions.append(points)
-    if not positions:
+    paths = [folder / f"particles_{frame}.npy" for frame in range(frames)]
+    present = [path.is_file() for path in paths]
+    if not present[0]:
         raise InputError(
             f"{folder} has no particles_0.npy: give the folder with particles_F.npy, one (P, 3) array a frame"
         )
+    count = max(frame for frame in range(frames) if present[frame]) + 1
+    if not all(present[:count]):
+        raise InputError(f"{paths[present.index(False)]} is missing: the truth needs every frame up to its last one")
+    if count < frames:
+        warnings.warn(f"{folder} ends at frame {count - 1} of {frames - 1}: later ones are not evaluated", stacklevel=2)
+    positions: list[np.ndarray] = []
+    for path in paths[:count]:
+        points = read_npy(path)
+        if points.ndim != 2 or points.shape[1] != 3 or (positions and points.shape != positions[0].shape):
+            raise InputError(f"{path} has shape {points.shape}: every frame needs the same particles, (P, 3)")
+        if len(points) < MIN_TRUE_PARTICLES:
+            raise InputError(f"{path} has {len(points)} particles: a shape needs {MIN_TRUE_PARTICLES} or more")
+        if not np.isfinite(points).all():
+            raise InputError(f"{path} has a position that is not finite")
+        positions.append(points)
     return np.stack(positions)
+
+
+def require_same_body(truth: np.ndarray, rest: np.ndarray, folder: Path) -> None:
+    """Raises InputError if the boxes around the ``truth`` (P, 3) and the reconstruction ``rest`` (Q, 3) [m] at frame 0
+    do not even overlap, or differ much in size: then one is of another scene or has another unit."""
+    ratio = float(np.ptp(truth, axis=0).max() / np.ptp(rest, axis=0).max())
+    if (
+        (truth.min(0) > rest.max(0)).any()
+        or (truth.max(0) < rest.min(0)).any()
+        or not 1 / _OTHER_SIZE < ratio < _OTHER_SIZE
+    ):
+        raise InputError(
+            f"{folder} is not of this scene: at frame 0 the true body is from {_point(truth.min(0))} to "
+            f"{_point(truth.max(0))} m, the reconstructed one from {_point(rest.min(0))} to {_point(rest.max(0))} m"
+        )
+
+
+def _point(values: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in values) + ")"
 
 
 def motion_numbers(

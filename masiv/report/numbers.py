@@ -119,6 +119,7 @@ def evaluation_numbers(
     The baselines start as the twin does, or, without one, as the first step of the trajectory does.
     """
     truth = measure.read_truth(truth_folder, run.frame_count)
+    measure.require_same_body(truth[0], trajectory.positions[0], truth_folder)
     seed = int(run.config["seed"])
     motions = {"trajectory": trajectory.positions}
     rest = trajectory.positions[0].astype(np.float64)

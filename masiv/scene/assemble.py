@@ -8,7 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from masiv.bounds import FPS
 from masiv.errors import InputError
+from masiv.scene.camera import check_cameras
 from masiv.scene.declaration import SceneDeclaration
 from masiv.scene.pictures import ESTIMATED, Pictures, crop_mask
 from masiv.scene.scene import Scene
@@ -45,6 +47,8 @@ def assemble(
     problems: Iterable[str] = (),
 ) -> Scene:
     """The scene. Raises InputError for a frame or camera without a picture and for a scene.yaml that does not fit."""
+    FPS.check(fps, f"{folder}: fps" if declaration.fps is None else f"{folder}/scene.yaml: fps")
+    check_cameras(pictures.cameras, str(folder))
     shutters = declaration.shutters(pictures.cameras, fps)
     cameras = tuple(replace(c, shutter=s) for c, s in zip(pictures.cameras, shutters, strict=True))
     pictures = replace(pictures, cameras=cameras)

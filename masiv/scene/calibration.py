@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from masiv.errors import InputError
 from masiv.files import write_json
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
+from masiv.strict import read_json, reason
 
 CALIBRATION = "calibration.json"
 _SCHEMA = 2
@@ -154,10 +154,10 @@ class Calibration:
     def load(cls, folder: Path) -> Calibration | None:
         """What ``save`` wrote into ``folder``; None if there is none. Raises InputError if it is broken."""
         path = Path(folder) / CALIBRATION
-        if not path.is_file():
+        if not path.exists():
             return None
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = read_json(path)
             if data["schema"] not in (1, _SCHEMA):  # 1 has no standard errors
                 raise ValueError(f"schema {data['schema']}")
             rows = data["cameras"]
@@ -168,8 +168,10 @@ class Calibration:
                 tuple(float(row["displacement_px"]) for row in rows),
                 tuple(None if (e := row.get("standard_error_px")) is None else float(e) for row in rows),
             )
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path} is not a calibration saved by masiv ({error}): reconstruct anew") from error
+        except (InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise InputError(
+                f"{path} is not a calibration saved by masiv ({reason(error, path)}): reconstruct anew"
+            ) from error
 
 
 def _same(one: Camera, other: Camera) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from masiv.errors import InputError
+from masiv.files import require_file
 
 PINHOLES = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4)}
 OTHERS = {2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 5: "OPENCV_FISHEYE", 6: "FULL_OPENCV"}
@@ -28,7 +29,7 @@ def read_pinhole(path: Path) -> ColmapCamera:
     """The first camera in ``path``. Raises InputError if it is missing, truncated or not a pinhole camera."""
     if not path.is_file():
         raise InputError(f"{path} is missing: the focal length is read from it")
-    data = path.read_bytes()
+    data = require_file(path).read_bytes()
     try:
         (count,) = struct.unpack_from("<Q", data)
         if count < 1:

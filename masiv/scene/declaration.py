@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
+from masiv.bounds import ACCELERATION, LENGTH, Density, Fps
 from masiv.errors import InputError
 from masiv.scene.camera import Camera
 from masiv.scene.depth import DepthNoise
@@ -82,11 +83,11 @@ class SceneDeclaration(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    fps: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    fps: Fps | None = None
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | Vector | None = None
     gravity: FiniteFloat | Vector | None = None
     ground: Literal["none"] | GroundDeclaration | None = None
-    density: Annotated[FiniteFloat, Field(gt=0)] | None = None
+    density: Density | None = None
     crop_box: tuple[Vector, Vector] | None = None
     fit_frames: Annotated[int, Field(ge=2)] | None = None
     exposure_time: NotNegative | dict[str, NotNegative] = 0.0
@@ -111,6 +112,7 @@ class SceneDeclaration(BaseModel):
     def gravity_vector(self, up: np.ndarray, default: float) -> np.ndarray:
         """Shape (3,) [m/s²]. ``default`` is the magnitude along −up."""
         value = default if self.gravity is None else self.gravity
+        ACCELERATION.check(np.atleast_1d(value), "scene.yaml: gravity")
         if isinstance(value, tuple):
             return np.array(value)
         return -abs(value) * up + 0.0  # + 0.0 turns −0 into 0
@@ -120,6 +122,7 @@ class SceneDeclaration(BaseModel):
         if self.ground == "none":
             return None
         if isinstance(self.ground, GroundDeclaration):
+            LENGTH.check(abs(self.ground.height), "scene.yaml: ground.height")
             ground = Ground(_unit(self.ground.normal, "ground.normal"), self.ground.height)
             if ground.normal @ up <= 0:
                 raise InputError("scene.yaml: ground.normal points away from up_axis: turn one of them round")

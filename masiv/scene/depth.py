@@ -8,11 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from masiv.errors import InputError
+from masiv.files import read_npy
 from masiv.scene.camera import Camera
+from masiv.scene.picture_file import read_raw
 
 MILLIMETRE = 1e-3
 """Unit [m] of the integers in depth pictures, unless a file says otherwise."""
@@ -64,14 +65,9 @@ def back_projected(camera: Camera, depth: np.ndarray, chosen: np.ndarray | None 
 
 def _numbers(path: Path) -> np.ndarray:
     if path.suffix == ".npy":
-        try:
-            values = np.load(path, allow_pickle=False)
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path} is not an array of numbers ({error})") from error
+        values = read_npy(path)
     else:
-        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if values is None:
-            raise InputError(f"{path} cannot be read as a picture: it is missing or broken")
+        values = read_raw(path)
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype.itemsize < 2:
         raise InputError(
             f"{path} is {values.dtype} of shape {values.shape}: a depth picture has one channel of 16 bits or more"

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from masiv.errors import InputError
+from masiv.strict import quoted
 
-
-def read_json(path: Path) -> Any:
-    """The content of ``path``. Raises InputError if it is missing or not JSON."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path} is missing") from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path} is not valid JSON: {error}") from error
+LARGEST = 2**1000
+"""Integers beyond are no numbers that a float holds."""
 
 
 def entries(value: Any, where: str, of_what: str) -> list[Any]:
@@ -42,8 +34,10 @@ def number(row: Mapping[str, Any], key: str, where: str, default: float | None =
     value = row.get(key, default)
     if value is None:
         raise InputError(f"{where} has no '{key}'")
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) > LARGEST:
+        value = math.inf
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where}: '{key}' is {value!r}, it must be a finite number")
+        raise InputError(f"{where}: '{key}' is {quoted(value)}, it must be a finite number")
     return float(value)
 
 
@@ -51,7 +45,9 @@ def text(row: Mapping[str, Any], key: str, where: str) -> str:
     """``row[key]``, a string that is not empty. Raises InputError."""
     value = row.get(key)
     if not isinstance(value, str) or not value:
-        raise InputError(f"{where} has no '{key}'" if value is None else f"{where}: '{key}' is {value!r}, not a name")
+        raise InputError(
+            f"{where} has no '{key}'" if value is None else f"{where}: '{key}' is {quoted(value)}, not a name"
+        )
     return value
 
 
@@ -61,7 +57,7 @@ def array(row: Mapping[str, Any], key: str, shapes: tuple[tuple[int, ...], ...],
         raise InputError(f"{where} has no '{key}'")
     try:
         values = np.array(row[key], dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: '{key}' is no matrix of numbers") from error
     if values.shape not in shapes or not np.isfinite(values).all():
         sizes = " or ".join("×".join(map(str, shape)) for shape in shapes)

@@ -14,9 +14,10 @@ from pathlib import Path
 from masiv.scene.assemble import Conventions
 from masiv.scene.declaration import read_declaration
 from masiv.scene.layout import Layout
-from masiv.scene.listing import mapping, read_json
+from masiv.scene.listing import mapping
 from masiv.scene.posed_frames import posed_scene, read_listing
 from masiv.scene.scene import Scene
+from masiv.strict import read_json
 
 LISTING = "transforms.json"
 CONVENTIONS = Conventions(up="z", ground_height=None, up_assumed=True)

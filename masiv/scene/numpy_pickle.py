@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from masiv.errors import InputError
+from masiv.files import require_file
+from masiv.strict import shortened
 
 _MODULES = ("multiarray", "numeric")
 ALLOWED = frozenset(
@@ -33,9 +35,9 @@ class _Arrays(pickle.Unpickler):
 def load_arrays(path: Path) -> Any:
     """The lists, dictionaries, numbers and numpy arrays in ``path``. Raises InputError for anything else in it."""
     try:
-        with path.open("rb") as file:
+        with require_file(path).open("rb") as file:
             return _Arrays(file).load()
-    except (OSError, EOFError, ImportError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is not a pickle file of numpy arrays ({error or type(error).__name__})") from error
-    except pickle.UnpicklingError as error:
-        raise InputError(f"{path} is not a pickle file of numpy arrays ({error})") from error
+    except InputError:
+        raise
+    except Exception as error:  # a pickle of something else, or a damaged one, raises what it likes
+        raise InputError(f"{path} is not a pickle file of numpy arrays ({shortened(error)})") from error

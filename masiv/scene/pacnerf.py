@@ -20,14 +20,15 @@ from masiv.scene.assemble import Conventions, assemble
 from masiv.scene.camera import Camera
 from masiv.scene.declaration import read_declaration
 from masiv.scene.layout import Layout
+from masiv.scene.listing import array, mapping, number, text
 from masiv.scene.listing import entries as listed_entries
-from masiv.scene.listing import read_json
 from masiv.scene.pictures import DEPTH, PLAIN, MaskSource, Pictures, common_size
 from masiv.scene.scene import Scene
-from masiv.scene.transforms import frame_of_time, opengl_c2w_to_world_to_camera, round_if_close
+from masiv.scene.transforms import count_frames, frame_of_time, opengl_c2w_to_world_to_camera, round_if_close
+from masiv.strict import quoted, read_json
 
 NAMES = ("all_data_full.json", "all_data.json")
-PICTURE = re.compile(r"^(?P<prefix>.*?)(?P<view>\d+)_(?P<frame>-?\d+)\.(png|jpg|jpeg)$", re.IGNORECASE)
+PICTURE = re.compile(r"^(?P<prefix>.*?)(?P<view>\d{1,9})_(?P<frame>-?\d{1,18})\.(png|jpg|jpeg)$", re.IGNORECASE)
 BACKGROUND, OCCLUDER = -1, -2
 CONVENTIONS = Conventions(up="y", ground_height=0.0)
 
@@ -56,7 +57,7 @@ def read(folder: Path) -> Scene:
     if not observed:
         raise InputError(f"{listing} lists no picture with a frame of 0 or more")
     view_ids = sorted({e.view for e in observed})
-    frame_count = _frame_count(observed, listing)
+    frame_count = count_frames({e.frame for e in observed}, str(listing))
     fps = declaration.fps or _fps(observed, listing)
     present = [e for e in observed if e.path.is_file() and e.path.stat().st_size > 0]
     cameras = tuple(_camera(view, observed, present, listing) for view in view_ids)
@@ -82,36 +83,26 @@ def read(folder: Path) -> Scene:
 def _entries(folder: Path, listing: Path) -> list[_Entry]:
     rows = listed_entries(read_json(listing), str(listing), "picture")
     entries: dict[tuple[int, int], _Entry] = {}
-    for number, row in enumerate(rows):
-        where = f"{listing}, entry {number}"
-        try:
-            name, pose, intrinsic, time = row["file_path"], row["c2w"], row["intrinsic"], float(row["time"])
-            intrinsics = np.array(intrinsic, dtype=np.float64)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{where}: needs file_path, c2w, intrinsic (3×3) and time, has a bad {error}") from error
+    for k, row in enumerate(rows):
+        where = f"{listing}, entry {k}"
+        row = mapping(row, where)
+        name, time = text(row, "file_path", where), number(row, "time", where)
+        intrinsics = array(row, "intrinsic", ((3, 3),), where)
+        if min(np.diag(intrinsics)) <= 0:
+            raise InputError(f"{where}: 'intrinsic' needs positive focal lengths")
         match = PICTURE.match(Path(name).name)
         if match is None:
-            raise InputError(f"{where}: '{name}' does not read as …_VIEW_FRAME.png")
-        if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all() or min(np.diag(intrinsics)) <= 0:
-            raise InputError(f"{where}: intrinsic must be 3×3, finite, with positive focal lengths")
-        if not np.isfinite(time):
-            raise InputError(f"{where}: time is {time}")
+            raise InputError(f"{where}: {quoted(name)} does not read as …_VIEW_FRAME.png")
+        pose = array(row, "c2w", ((3, 4), (4, 4)), where)
         try:
             world_to_camera = opengl_c2w_to_world_to_camera(pose)
-        except (InputError, ValueError) as error:
+        except InputError as error:
             raise InputError(f"{where}: {error}") from error
         key = int(match["view"]), int(match["frame"])
         if key in entries:
             raise InputError(f"{where}: view {key[0]}, frame {key[1]} is listed twice")
         entries[key] = _Entry(*key, folder / name, time, intrinsics, world_to_camera)
     return list(entries.values())
-
-
-def _frame_count(observed: list[_Entry], listing: Path) -> int:
-    frames = sorted({e.frame for e in observed})
-    if len(frames) < 2:
-        raise InputError(f"{listing} has one frame only: a motion needs two or more")
-    return frames[-1] + 1
 
 
 def _fps(observed: list[_Entry], listing: Path) -> float:

@@ -9,6 +9,7 @@ board lies on the table at z = 0 and −z is up.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,15 +22,17 @@ from masiv.scene.camera import Camera
 from masiv.scene.declaration import read_declaration
 from masiv.scene.layout import Layout
 from masiv.scene.lens import HALF
-from masiv.scene.listing import entries, mapping, number, read_json
+from masiv.scene.listing import array, entries, mapping, number
 from masiv.scene.numpy_pickle import load_arrays
 from masiv.scene.pictures import PLAIN, MaskSource, Pictures, common_size
 from masiv.scene.scene import Scene
-from masiv.scene.transforms import opengl_c2w_to_world_to_camera
+from masiv.scene.transforms import count_frames, opengl_c2w_to_world_to_camera
+from masiv.strict import read_json
 
 METADATA, CALIBRATION = "metadata.json", "calibrate.pkl"
 CONVENTIONS = Conventions(up="-z", ground_height=0.0)
 TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+NUMBER = re.compile(r"^[0-9]{1,18}$")
 HAND = "hand"
 """What PhysTwin calls the hand that moves the object."""
 PICTURES, DEPTHS = (".png", ".jpg", ".jpeg"), (".npy", ".png")
@@ -58,9 +61,7 @@ def read(folder: Path) -> Scene:
         found = _numbered(folder / "depth" / str(view), DEPTHS)
         depths |= {(view, frame): path for frame, path in found.items() if frame in files}
         masks |= {(view, frame): source for frame, source in _masks(folder, view, files, problems).items()}
-    frame_count = max(frame for _, frame in paths) + 1
-    if frame_count < 2:
-        raise InputError(f"{folder} has one frame only: a motion needs two or more")
+    frame_count = count_frames({frame for _, frame in paths}, str(folder))
     pictures = Pictures(paths=paths, masks=masks, cameras=tuple(cameras), depths=depths)
     fps = declaration.fps or number(metadata, "fps", str(folder / METADATA))
     if fps <= 0:
@@ -74,13 +75,7 @@ def read(folder: Path) -> Scene:
 def _intrinsics(metadata: Mapping[str, Any], where: Path) -> list[np.ndarray]:
     matrices = []
     for k, rows in enumerate(entries(metadata.get("intrinsics"), f"{where}: 'intrinsics'", "camera")):
-        try:
-            matrix = np.array(rows, dtype=np.float64)
-        except (TypeError, ValueError):
-            matrix = np.zeros(())
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(np.diag(matrix)) <= 0:
-            raise InputError(f"{where}: intrinsics of camera {k} must be 3×3, finite, with positive focal lengths")
-        matrices.append(matrix + HALF)
+        matrices.append(array({"intrinsics": rows}, "intrinsics", ((3, 3),), f"{where}, camera {k}") + HALF)
     return matrices
 
 
@@ -89,7 +84,7 @@ def _poses(path: Path, count: int) -> list[np.ndarray]:
     content = load_arrays(path)
     try:
         poses = np.array(content, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         poses = np.zeros(())
     if poses.shape != (count, 4, 4):
         raise InputError(f"{path} must contain a camera-to-world pose 4×4 for each of the {count} cameras")
@@ -103,7 +98,12 @@ def _numbered(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """The files FRAME.suffix of ``folder`` by frame; of two suffixes the first."""
     if not folder.is_dir():
         return {}
-    found = [p for suffix in reversed(suffixes) for p in folder.glob(f"*{suffix}") if p.stem.isdecimal()]
+    found = [
+        p
+        for suffix in reversed(suffixes)
+        for p in folder.glob(f"*{suffix}")
+        if p.stem.isdecimal() and len(p.stem) <= 18 and p.is_file()
+    ]
     return dict(sorted((int(path.stem), path) for path in found))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -17,6 +16,7 @@ from masiv.scene.background import BackgroundModel, learn_background
 from masiv.scene.camera import Camera
 from masiv.scene.depth import MILLIMETRE, DepthNoise, depth_size, read_depth
 from masiv.scene.lens import Lens
+from masiv.scene.picture_file import png_size, read_raw
 from masiv.scene.scene import Frame
 from masiv.scene.segmenter import Prompt, Segmentation, VideoSegmenter
 
@@ -266,10 +266,7 @@ def _file_state(path: Path | None) -> list[str | int]:
 
 def read_pixels(path: Path) -> np.ndarray:
     """The picture (H, W, 3) RGB or (H, W, 4) RGBA, uint8. Raises InputError if the file is not a picture."""
-    raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if raw is None:
-        raise InputError(f"{path} cannot be read as a picture: replace it or remove it from the listing")
-    raw = np.asarray(raw)
+    raw = read_raw(path)
     if raw.dtype == np.uint16:
         raw = (raw // 256).astype(np.uint8)
     if raw.dtype != np.uint8:
@@ -281,11 +278,10 @@ def read_pixels(path: Path) -> np.ndarray:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height [pixels], from the header if the file is a PNG."""
-    with path.open("rb") as file:
-        head = file.read(24)
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
-        return struct.unpack(">II", head[16:24])
-    height, width = read_pixels(path).shape[:2]
+    size = png_size(path)
+    if size is not None:
+        return size
+    height, width = read_raw(path).shape[:2]
     return width, height
 
 

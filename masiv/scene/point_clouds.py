@@ -12,17 +12,21 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData
 
+from masiv.bounds import FPS, LENGTH
 from masiv.errors import InputError
+from masiv.files import require_file
 from masiv.scene.assemble import Conventions, guesses
 from masiv.scene.cloud import Cloud
 from masiv.scene.declaration import SceneDeclaration, read_declaration
 from masiv.scene.frame_cache import Frame
 from masiv.scene.layout import Layout
 from masiv.scene.scene import Scene
+from masiv.scene.transforms import count_frames
+from masiv.strict import shortened
 
-NAME = re.compile(r"^(?:cloud_)?(\d+)\.ply$", re.IGNORECASE)
+NAME = re.compile(r"^(?:cloud_)?(\d{1,18})\.ply$", re.IGNORECASE)
 CONVENTIONS = Conventions(up="z", ground_height=None, up_assumed=True)
 MIN_POINTS = 50
 """Fewer points do not show a shape."""
@@ -39,6 +43,7 @@ def read(folder: Path) -> Scene:
     files = _files(folder)
     if declaration.fps is None:
         raise InputError(f"{folder / 'scene.yaml'} must give fps: point clouds have no times")
+    FPS.check(declaration.fps, f"{folder / 'scene.yaml'}: fps")
     for key, of in (("depth_unit", "depth pictures"), ("depth_noise", "depth pictures"), ("masks", "pictures")):
         if getattr(declaration, key) is not None:
             raise InputError(f"{folder / 'scene.yaml'}: {key} is for {of}, {folder} has point clouds: remove it")
@@ -68,14 +73,18 @@ def read(folder: Path) -> Scene:
 def read_cloud(path: Path) -> Cloud:
     """The vertices of the PLY file ``path``. Raises InputError if it is broken or a coordinate is not finite."""
     try:
-        rows = PlyData.read(str(path))["vertex"].data
-    except (OSError, PlyParseError, KeyError, ValueError) as error:
-        raise InputError(f"{path} is not a PLY file with vertices ({error or type(error).__name__})") from error
-    points = _columns(rows, "x", "y", "z")
+        rows = PlyData.read(str(require_file(path)))["vertex"].data
+        points = _columns(rows, "x", "y", "z")
+    except InputError:
+        raise
+    except Exception as error:  # the library raises what it likes for a damaged file
+        raise InputError(f"{path} is not a PLY file with vertices ({shortened(error)})") from error
     if points is None:
         raise InputError(f"{path}: its vertices have no x, y, z")
     if not np.isfinite(points).all():
         raise InputError(f"{path}: {int((~np.isfinite(points)).any(axis=1).sum())} points are not finite: remove them")
+    if len(points):
+        LENGTH.check(float(np.abs(points).max()), f"{path}: a coordinate")
     normals, colours = _columns(rows, "nx", "ny", "nz"), _columns(rows, "red", "green", "blue")
     if normals is not None:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -93,11 +102,9 @@ def _files(folder: Path) -> tuple[Path, ...]:
             other = found.setdefault(int(match[1]), path)
             if other != path:
                 raise InputError(f"{folder}: {other.name} and {path.name} are both frame {int(match[1])}: leave one")
-    missing = sorted(set(range(max(found) + 1)) - set(found))
+    missing = sorted(set(range(count_frames(found, str(folder)))) - set(found))
     if missing:
         raise InputError(f"{folder} has no point cloud of frame {missing[0]}: frames must run from 0 without gaps")
-    if len(found) < 2:
-        raise InputError(f"{folder} has one frame only: a motion needs two or more")
     return tuple(found[frame] for frame in sorted(found))
 
 

@@ -16,10 +16,11 @@ from masiv.scene.camera import Camera
 from masiv.scene.declaration import SceneDeclaration
 from masiv.scene.depth import MILLIMETRE
 from masiv.scene.lens import Lens, read_lens
-from masiv.scene.listing import array, entries, mapping, number, read_json, text
+from masiv.scene.listing import array, entries, mapping, number, text
 from masiv.scene.pictures import OWN_ALPHA, PLAIN, MaskSource, Pictures, common_size, has_transparency, image_size
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import TimeGrid, opengl_c2w_to_world_to_camera
+from masiv.strict import read_json
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 

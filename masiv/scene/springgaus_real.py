@@ -21,10 +21,11 @@ from masiv.scene.camera import Camera
 from masiv.scene.colmap import ColmapCamera, read_pinhole
 from masiv.scene.declaration import read_declaration
 from masiv.scene.layout import Layout
-from masiv.scene.listing import array, entries, mapping, read_json
+from masiv.scene.listing import array, entries, mapping
 from masiv.scene.pictures import PLAIN, MaskSource, Pictures, common_size
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import rotation_vector_to_world_to_camera
+from masiv.strict import read_json
 
 CONVENTIONS = Conventions(up="-z", ground_height=0.025)  # height is along up
 FPS = 120.0

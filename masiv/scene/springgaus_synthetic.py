@@ -19,10 +19,11 @@ from masiv.scene.assemble import Conventions, assemble
 from masiv.scene.camera import Camera
 from masiv.scene.declaration import read_declaration
 from masiv.scene.layout import Layout
-from masiv.scene.listing import array, entries, mapping, number, read_json, text
+from masiv.scene.listing import array, entries, mapping, number, text
 from masiv.scene.pictures import OWN_ALPHA, PLAIN, Pictures, common_size, has_transparency
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import TimeGrid, opengl_c2w_to_world_to_camera
+from masiv.strict import read_json
 
 CONVENTIONS = Conventions(up="y", ground_height=0.3)
 LOW_GROUND = frozenset({"C", "E", "V", "rope", "toothpaste"})

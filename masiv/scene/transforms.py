@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -108,6 +108,24 @@ class TimeGrid:
 def round_if_close(fps: float) -> float:
     """``fps``, rounded to an integer if that changes it by less than 0.1 %: files give times with few digits."""
     return float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else float(fps)
+
+
+MAX_GAP_FACTOR = 100
+"""Frames without a picture are interpolated; a recording of which fewer than one frame in so many has one is none."""
+
+
+def count_frames(frames: Collection[int], where: str) -> int:
+    """The number of frames 0 … of a recording with pictures at ``frames``. Raises InputError if it is no motion, or if
+    the numbers are no frames, for example time stamps."""
+    if len(frames) < 2:
+        raise InputError(f"{where} has one frame only: a motion needs two or more")
+    last = max(frames)
+    if last >= MAX_GAP_FACTOR * len(frames):
+        raise InputError(
+            f"{where}: frame numbers go up to {last}, but only {len(frames)} frames have pictures, as if they were "
+            "time stamps: number the frames 0, 1, 2, …"
+        )
+    return last + 1
 
 
 def frame_of_time(time: float, fps: float) -> int:

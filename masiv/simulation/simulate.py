@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from masiv import runtime
+from masiv.bounds import ACCELERATION, SPEED, SPIN
 from masiv.errors import InputError
 from masiv.progress import Progress, silent
 from masiv.simulation.flight import simulate_flight
@@ -16,7 +17,11 @@ from masiv.simulation.free_body import simulate_free_body
 from masiv.simulation.release import simulate_release
 from masiv.simulation.rollout import Rollout
 from masiv.simulation.variation import without_effects
+from masiv.strict import quoted
 from masiv.twin import Twin
+
+MAX_FRAMES = 10**6
+"""Eleven hours at 24 frames a second; the motion of a thousand particles then takes 12 GB."""
 
 
 def simulate(
@@ -44,13 +49,16 @@ def simulate(
     a condition that the twin does not have, for a force that starts after the last frame and for what this kind of body
     cannot have; NonFiniteError if the motion diverges.
     """
-    if frames < 1:
-        raise InputError(f"--frames {frames}: give at least 1")
+    if not 1 <= frames <= MAX_FRAMES:
+        raise InputError(f"--frames {quoted(frames)}: give 1 to {MAX_FRAMES}")
     if substeps is not None and substeps < 1:
         raise InputError(f"substeps {substeps}: give at least 1")
-    for name, value in (("velocity", velocity), ("omega", omega), ("gravity", gravity)):
-        if value is not None and (np.shape(value) != (3,) or not np.isfinite(value).all()):
-            raise InputError(f"--{name} takes three finite numbers X,Y,Z")
+    given = (("velocity", velocity, SPEED), ("omega", omega, SPIN), ("gravity", gravity, ACCELERATION))
+    for name, value, bound in given:
+        if value is not None:
+            if np.shape(value) != (3,) or not np.isfinite(value).all():
+                raise InputError(f"--{name} takes three finite numbers X,Y,Z")
+            bound.check(value, f"--{name}")
     twin = without_effects(twin, without).in_condition(condition)
     rate = twin.fps if fps is None else fps
     if force is not None and force.start >= (frames - 1) / rate:
@@ -65,6 +73,9 @@ def simulate(
         if twin.initial_conditions[0].release is not None:
             _refuse("the body is let go from rest", **motion, force=force, substeps=substeps)
             return simulate_release(twin, frames=frames, fps=rate)
+        if force is not None:
+            acceleration = np.asarray(force.force) / (twin.density * twin.volume)
+            ACCELERATION.check(acceleration, f"--force, on {twin.density * twin.volume:.3g} kg")
         twin = twin.with_motion(**{n: np.asarray(v, dtype=np.float64) for n, v in motion.items() if v is not None})
         return simulate_free_body(twin, frames=frames, fps=rate, force=force, substeps=substeps, progress=progress)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from masiv.bounds import DENSITY, LENGTH
 from masiv.errors import InputError
 from masiv.mpm.design import grid_spacing
 from masiv.scene.scene import Ground
@@ -30,8 +31,7 @@ def without_effects(twin: Twin, names: tuple[str, ...]) -> Twin:
 
 def with_density(twin: Twin, density: float) -> Twin:
     """``twin`` with another density [kg/m^3]; its moduli stay. Raises InputError."""
-    if not (math.isfinite(density) and density > 0):
-        raise InputError(f"--density {density:g}: give a density above 0 kg/m³")
+    DENSITY.check(density, f"--density {density:g}")
     return twin.with_body(density=float(density))
 
 
@@ -52,7 +52,8 @@ def with_ground(twin: Twin, ground: str) -> Twin:
     except ValueError:
         height = math.nan
     if not math.isfinite(height):
-        raise InputError(f"--ground {ground}: give 'none' or a height in metres")
+        raise InputError(f"--ground {ground[:40]}: give 'none' or a height in metres")
+    LENGTH.check(abs(height), f"--ground {ground[:40]}")
     lowest = float((twin.positions.astype(np.float64) @ normal).min())
     if lowest < height - grid_spacing(twin.volume, len(twin.positions), twin.simulator):
         raise InputError(f"--ground {ground}: the body reaches down to {lowest:.3g} m, give a lower ground")

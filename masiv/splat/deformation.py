@@ -7,10 +7,10 @@ import math
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 
 from masiv.errors import InputError
-from masiv.files import write_safetensors
+from masiv.files import read_safetensors, write_safetensors
+from masiv.strict import reason
 
 
 class DeformationNetwork(torch.nn.Module):
@@ -144,13 +144,15 @@ class DeformationNetwork(torch.nn.Module):
     def load(cls, path: Path) -> DeformationNetwork:
         """Read what ``save`` wrote. Raises InputError if ``path`` is missing or another file."""
         try:
-            with safe_open(path, framework="pt") as file:
-                settings = json.loads((file.metadata() or {})["masiv_deformation"])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}
+            arrays, metadata = read_safetensors(path)
+            settings = json.loads(metadata["masiv_deformation"])
+            tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
             network = cls(centre=tensors["centre"], base_motion=tensors["base_motion"], **settings)
             network.to(tensors["base_motion"].dtype).load_state_dict(tensors)
-        except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise InputError(f"{path} is not a motion saved by masiv ({error}); run reconstruct again") from error
+        except (InputError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise InputError(
+                f"{path} is not a motion saved by masiv ({reason(error, path)}); run reconstruct again"
+            ) from error
         return network
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from masiv.errors import InputError, MasivError
-from masiv.files import atomic
+from masiv.files import atomic, require_file
+from masiv.strict import reason
 
 _SH_DEGREE_0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 1/2 + _SH_DEGREE_0 f_dc."""
@@ -59,11 +60,12 @@ class Gaussians:
     def load_ply(cls, path: Path) -> Gaussians:
         """Read a file in the 3DGS layout. Raises InputError if it is missing, broken or anisotropic."""
         try:
-            rows = PlyData.read(str(path))["vertex"].data
+            rows = PlyData.read(str(require_file(path)))["vertex"].data
             columns = {name: np.asarray(rows[name], dtype=np.float64) for name in _COLUMNS if name[0] != "n"}
-        except (OSError, PlyParseError, KeyError, ValueError) as error:
-            detail = f"{error}" or type(error).__name__
-            raise InputError(f"{path} is not a PLY file of Gaussians ({detail}); run reconstruct again") from error
+        except Exception as error:  # the library raises what it likes for a damaged file
+            raise InputError(
+                f"{path} is not a PLY file of Gaussians ({reason(error, path)}); run reconstruct again"
+            ) from error
         for name, column in columns.items():
             if not np.isfinite(column).all():
                 raise InputError(f"{path}: {name} of a Gaussian is not finite; run reconstruct again")

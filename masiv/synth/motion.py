@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 _PARTICLES_PER_CELL = 8
 _COURANT = 0.25
 _NEIGHBOURS = 16
+MAX_SUBSTEPS = 20_000
+"""In a frame: at 50 ms a substep that is a quarter of an hour, for a motion that nobody sees between two frames."""
 
 
 def simulate(spec: SynthSpec, body: Solid) -> np.ndarray:
@@ -46,6 +48,11 @@ def simulate(spec: SynthSpec, body: Solid) -> np.ndarray:
     )
     rate = max((speed + fall) / (_COURANT * spacing), 1 / diffusion)
     per_frame = max(1, math.ceil(rate / spec.fps))
+    if per_frame > MAX_SUBSTEPS:
+        raise InputError(
+            f"a frame needs {per_frame:.3g} substeps, more than {MAX_SUBSTEPS}: give a softer or a heavier material, a "
+            "larger fps, a lower speed or fewer particles"
+        )
     simulator = Simulator(
         particle_count=count,
         spacing=spacing,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from masiv.bounds import ACCELERATION, FRICTION, LENGTH, SIZE, SPEED, SPIN, Density, Fps
 from masiv.errors import InputError
 from masiv.shapes import ShapeSpec
 from masiv.strict import read_yaml, validated
@@ -23,7 +25,7 @@ class MaterialSpec(_Part):
 
     law: str = "neo_hookean"
     parameters: dict[str, float] = {"youngs_modulus": 4e4, "poissons_ratio": 0.3}
-    density: float = Field(1000.0, gt=0, description="[kg/m^3]")
+    density: Density = Field(1000.0, description="[kg/m^3]")
 
 
 class CameraSpec(_Part):
@@ -31,7 +33,7 @@ class CameraSpec(_Part):
 
     count: int = Field(11, ge=2, le=200)
     size: int = Field(128, ge=16, le=2048, description="side of the square pictures [pixels]")
-    distance: float = Field(2.4, gt=0, description="to the vertical axis through the target [m]")
+    distance: float = Field(2.4, gt=0, le=LENGTH.upper, description="to the vertical axis through the target [m]")
     heights: tuple[float, ...] = Field((0.5, 1.1, 1.9), min_length=1, description="taken in turn [m]")
     target: Vector = Field((0, 0.3, 0), description="all cameras look at it [m]")
     field_of_view_deg: float = Field(36.0, gt=1, lt=150)
@@ -46,17 +48,17 @@ class SynthSpec(_Part):
     omega: Vector = Field((0, 0, 0), description="spin at frame 0 [rad/s]")
     gravity: Vector = Field((0, -9.8, 0), description="[m/s^2]")
     contact: Literal["sticky", "release", "slip"] = "sticky"
-    friction: float = Field(0.0, ge=0, description="Coulomb's coefficient of contact slip")
+    friction: float = Field(0.0, ge=0, le=FRICTION.upper, description="Coulomb's coefficient of contact slip")
     effects: dict[str, dict[str, float]] = Field(
         {}, description="of masiv.effects, by name, with their parameters: simulated, but declared only in truth.yaml"
     )
-    frames: int = Field(12, ge=2)
-    fps: float = Field(24.0, gt=0)
+    frames: int = Field(12, ge=2, le=10**5)
+    fps: Fps = 24.0
     cameras: CameraSpec = CameraSpec.model_validate({})
     texture: Literal["noise", "stripes", "patches"] = "noise"
     image_noise: float = Field(1.5, ge=0, description="standard deviation, of 255")
     supersampling: Annotated[int, Field(ge=1, le=8)] = 3
-    particles: int = Field(20000, ge=100, description="in the simulation")
+    particles: int = Field(20000, ge=100, le=10**7, description="in the simulation")
     truth_particles: int = Field(4096, ge=1, description="of them in gt/")
     seed: int = Field(0, ge=0)
 
@@ -64,10 +66,26 @@ class SynthSpec(_Part):
 def read_spec(path: Path) -> SynthSpec:
     """The spec in a YAML file. Raises InputError, with the nearest known key, if something is wrong with it."""
     spec = validated(SynthSpec, read_yaml(path), str(path))
+    _check(spec, str(path))
     mesh = spec.shape.mesh
     if mesh is None:
         return spec
     located = mesh if mesh.is_absolute() else path.parent / mesh
     if not located.is_file():
-        raise InputError(f"{path}: shape.mesh {located} does not exist")
+        raise InputError(f"{path}: shape.mesh {located} does not exist or is not a regular file")
     return spec.model_copy(update={"shape": spec.shape.model_copy(update={"mesh": located})})
+
+
+def _check(spec: SynthSpec, where: str) -> None:
+    """Raises InputError for what no body does, and for cameras that do not look at the body from outside."""
+    SIZE.check(spec.shape.size, f"{where}: shape.size")
+    SPEED.check(math.hypot(*spec.velocity), f"{where}: velocity")
+    SPIN.check(math.hypot(*spec.omega), f"{where}: omega")
+    ACCELERATION.check(math.hypot(*spec.gravity), f"{where}: gravity")
+    reach = max(math.hypot(*spec.shape.position), spec.shape.clearance, *map(abs, spec.cameras.target))
+    LENGTH.check(max(reach, *map(abs, spec.cameras.heights)), f"{where}: a place of the body or the cameras")
+    if spec.cameras.distance < spec.shape.size / 2:
+        raise InputError(
+            f"{where}: cameras.distance is {spec.cameras.distance:g} m, inside of the body of {spec.shape.size:g} m: "
+            "move the cameras away"
+        )

@@ -33,8 +33,21 @@ def synthesise(spec: SynthSpec, out: Path, *, progress: Progress = silent) -> No
     draft = out.with_name(out.name + ".tmp")
     if draft.exists():
         shutil.rmtree(draft)
-    (draft / "data").mkdir(parents=True)
-    (draft / "gt").mkdir()
+    try:
+        (draft / "data").mkdir(parents=True)
+        (draft / "gt").mkdir()
+        _write_scene(spec, draft, progress)
+        if out.exists():
+            out.rmdir()
+        os.replace(draft, out)
+    except BaseException as error:
+        shutil.rmtree(draft, ignore_errors=True)
+        if isinstance(error, OSError):
+            error.filename = str(out)  # not the temporary name, or none at all
+        raise
+
+
+def _write_scene(spec: SynthSpec, draft: Path, progress: Progress) -> None:
     progress("simulate", 0, 1)
     body = make_body(spec.shape, spec.particles)
     motion = simulate(spec, body)
@@ -66,9 +79,6 @@ def synthesise(spec: SynthSpec, out: Path, *, progress: Progress = silent) -> No
         "simulated_particles": len(body.particles),
     }
     (draft / "truth.yaml").write_text(yaml.safe_dump(truth, sort_keys=False), encoding="utf-8")
-    if out.exists():
-        out.rmdir()
-    os.replace(draft, out)
 
 
 def ring(spec: CameraSpec) -> tuple[Camera, ...]:
@@ -105,5 +115,6 @@ def _entry(camera: Camera, view: int, frame: int, fps: float) -> dict:
 
 
 def _write(path: Path, rgb: np.ndarray) -> None:
-    if not cv2.imwrite(str(path), np.ascontiguousarray(rgb.astype(np.uint8)[..., ::-1]), _SMALL):
-        raise InputError(f"cannot write {path}")
+    written, data = cv2.imencode(".png", np.ascontiguousarray(rgb.astype(np.uint8)[..., ::-1]), _SMALL)
+    assert written
+    path.write_bytes(data.tobytes())  # which says why it cannot be written

@@ -7,12 +7,15 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
+from masiv.bounds import DENSITY, MASS, SIZE, VISCOSITY, Density, Fps
 from masiv.scene.declaration import GroundDeclaration, SceneDeclaration, Vector
 
 Unit = Literal["m", "cm", "mm"]
 METRES: dict[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-Positive = Annotated[FiniteFloat, Field(gt=0)]
+Side = Annotated[FiniteFloat, Field(gt=0, le=SIZE.upper / METRES["mm"])]
+"""Of a body, in the unit of the geometry, which is a millimetre at least."""
 Axis = Literal["x", "y", "z"]
+Frame = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class _Part(BaseModel):
@@ -22,8 +25,8 @@ class _Part(BaseModel):
 class CylinderDeclaration(_Part):
     """Its axis is z, its middle the origin."""
 
-    diameter: Positive
-    length: Positive
+    diameter: Side
+    length: Side
 
 
 class HalfSpaceDeclaration(_Part):
@@ -64,8 +67,8 @@ class GeometryDeclaration(_Part):
 
     units: Unit
     mesh: Path | None = None
-    box: tuple[Positive, Positive, Positive] | None = None
-    sphere: Positive | None = None
+    box: tuple[Side, Side, Side] | None = None
+    sphere: Side | None = None
     cylinder: CylinderDeclaration | None = None
     markers_at: dict[str, Vector] | None = None
     position: Vector | None = None
@@ -93,8 +96,8 @@ class BodyDeclaration(_Part):
     """
 
     geometry: GeometryDeclaration | None = None
-    density: Positive | None = None
-    mass: Positive | None = None
+    density: Density | None = None
+    mass: Annotated[float, MASS.field()] | None = None
     poissons_ratio: Annotated[FiniteFloat, Field(gt=-1, lt=0.5)] | None = None
     group: str | None = None
     clamp: ClampDeclaration | None = None
@@ -142,8 +145,8 @@ class RunDeclaration(_Part):
     use: Literal["fit", "hold_out", "test"] = "fit"
     condition: str = ""
     select: dict[str, str | int | float] = {}
-    markers: tuple[str, ...] | None = None
-    rest_frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = None
+    markers: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    rest_frames: tuple[Frame, Frame] | None = None
     release_time: FiniteFloat | None = None
     ignore_after_release: Annotated[FiniteFloat, Field(ge=0)] = 0.0
     time: tuple[FiniteFloat, FiniteFloat] | None = None
@@ -176,12 +179,12 @@ class TracksDeclaration(_Part):
 
     layout: Literal["tracks"]
     units: Unit | None = None
-    rate: Positive | None = None
+    rate: Fps | None = None
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | Vector | None = None
     gravity: FiniteFloat | Vector | None = None
     ground: Literal["none"] | GroundDeclaration | None = None
-    medium_density: Positive = 1.2
-    medium_viscosity: Positive = 1.8e-5
+    medium_density: Annotated[float, Field(gt=0, le=DENSITY.upper)] = 1.2
+    medium_viscosity: Annotated[float, Field(gt=0, le=VISCOSITY.upper)] = 1.8e-5
     columns: ColumnsDeclaration | None = None
     bodies: dict[str, BodyDeclaration] = Field(min_length=1)
     runs: tuple[RunDeclaration, ...] = Field(min_length=1)

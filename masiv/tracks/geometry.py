@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from masiv.bounds import SIZE
 from masiv.errors import InputError, MasivError
 from masiv.mesh import read_mesh
 from masiv.tracks.declaration import METRES, GeometryDeclaration
@@ -59,6 +60,14 @@ class Geometry:
 
 def make_geometry(declared: GeometryDeclaration, folder: Path) -> Geometry:
     """The solid that ``declared`` says; mesh files are relative to ``folder``. InputError for an unusable mesh."""
+    made = _solid(declared, folder)
+    SIZE.check(made.size, "scene.yaml: the geometry of a body")
+    if not 0 < made.volume < math.inf:
+        raise InputError(f"scene.yaml: the geometry of a body has a volume of {made.volume:g} m³: correct its numbers")
+    return made
+
+
+def _solid(declared: GeometryDeclaration, folder: Path) -> Geometry:
     import trimesh
 
     unit = METRES[declared.units]
@@ -74,10 +83,7 @@ def make_geometry(declared: GeometryDeclaration, folder: Path) -> Geometry:
         mesh = trimesh.creation.cylinder(radius=radius, height=length, sections=48)
         return _primitive("cylinder", mesh, math.pi * radius**2 * length, np.array([radius, radius, length / 2]))
     assert declared.mesh is not None
-    path = folder / declared.mesh
-    if not path.is_file():
-        raise InputError(f"{path} does not exist: correct geometry.mesh in scene.yaml")
-    mesh = read_mesh(path)
+    mesh = read_mesh(folder / declared.mesh)
     vertices = unit * np.array(mesh.vertices, np.float64)
     volume = abs(float(mesh.volume)) * unit**3
     return Geometry("mesh", vertices, np.array(mesh.faces), volume, vertices.min(0), vertices.max(0))

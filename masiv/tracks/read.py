@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from masiv.bounds import FPS, LENGTH, TIME
 from masiv.errors import InputError
 from masiv.scene.layout import Layout
 from masiv.strict import read_yaml, validated
@@ -120,6 +121,7 @@ def _run(
     markers, positions = _select_markers(where, run, table)
     positions = positions * _unit(where, table, declared, problems)
     times, rate = _times(where, table, declared, problems)
+    LENGTH.check(float(np.nanmax(np.abs(positions), initial=0)), f"{folder / run.file}: a position")
     if table.ignored:
         problems.append(f"{where}: columns not used: {', '.join(table.ignored)}")
     for m, marker in enumerate(markers):
@@ -188,6 +190,7 @@ def _times(where: str, table: Table, declared: TracksDeclaration, problems: list
             )
         return np.arange(count) / declared.rate, declared.rate
     times = table.times
+    TIME.check(float(np.nanmax(np.abs(times), initial=0)), f"scene.yaml: {where}: a time of its file")
     if not np.isfinite(times).all():
         raise InputError(f"scene.yaml: {where}: frame {int(np.argmin(np.isfinite(times)))} has no time")
     steps = np.diff(times)
@@ -198,6 +201,7 @@ def _times(where: str, table: Table, declared: TracksDeclaration, problems: list
             "increase (a file of several recordings needs select)"
         )
     usual = float(np.median(steps))
+    FPS.check(1 / usual, f"scene.yaml: {where}: the rate of its times")
     uneven = float(np.abs(steps / usual - 1).max())
     if uneven > 0.05:
         problems.append(f"{where}: frames are not even: {1e3 * steps.min():.1f} to {1e3 * steps.max():.1f} ms apart")

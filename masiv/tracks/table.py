@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import io
 import re
-import struct
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from masiv.errors import InputError
+from masiv.strict import quoted, shortened
 from masiv.tracks.declaration import ColumnsDeclaration
 
 _POSITION = re.compile(r"^(?P<marker>.+?)[ _.:](?P<axis>[xyzXYZ])(?:[ _]?[\[(]?(?P<unit>mm|cm|m)[\])]?)?$")
@@ -41,7 +43,7 @@ def read_table(path: Path, columns: ColumnsDeclaration | None, select: Mapping[s
     """The points of a CSV or C3D file. Raises InputError if it cannot be read."""
     ending = path.suffix.lower()
     if not path.is_file():
-        raise InputError(f"{path} does not exist: correct runs.file in scene.yaml")
+        raise InputError(f"{path} does not exist or is not a regular file: correct runs.file in scene.yaml")
     if ending == ".csv":
         return read_csv(path, columns, select)
     if ending == ".c3d":
@@ -98,18 +100,24 @@ def read_c3d(path: Path) -> Table:
     import c3d
 
     try:
-        with path.open("rb") as file, warnings.catch_warnings():
+        with path.open("rb") as file, warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")  # it warns where there are no analog channels
             reader = c3d.Reader(file)
             labels = tuple(" ".join(label.split()) for label in reader.point_labels)
-            frames = [np.array(points, np.float64) for _, points, _ in reader.read_frames()]
             unit = reader.get("POINT:UNITS")
             rate = float(reader.point_rate)
-            first = int(reader.first_frame)
-    except (OSError, AssertionError, ValueError, KeyError, IndexError, AttributeError, struct.error) as error:
-        raise InputError(f"{path} is not a C3D file that can be read: {error}") from error
-    if not frames:
-        raise InputError(f"{path} has no frames")
+            first, last = int(reader.first_frame), int(reader.last_frame)
+            frames = [np.array(points, np.float64) for _, points, _ in reader.read_frames()]
+    except Exception as error:  # the library raises what it likes for a damaged file
+        raise InputError(f"{path} is not a C3D file that can be read: {shortened(error)}") from error
+    if len(frames) < last - first + 1:  # the library stops with a warning
+        raise InputError(
+            f"{path} is cut short: its header says {last - first + 1} frames, there are {len(frames)}: copy it anew"
+        )
+    if not frames or not labels:
+        raise InputError(f"{path} has no frames or no points")
+    if not (np.isfinite(rate) and rate > 0):
+        raise InputError(f"{path}: its rate is {rate:g} Hz, it must be positive")
     points = np.stack(frames)[:, : len(labels)]
     positions = np.where(points[:, :, 3:4] < 0, np.nan, points[:, :, :3])
     name = None if unit is None else unit.string_value.strip().lower()
@@ -133,6 +141,13 @@ def _by_name(path: Path, header: list[str]) -> tuple[Mapping[str, Mapping[Any, s
                 units.add(match["unit"])
         elif time is None and _TIME.match(column):
             time = column
+    axes = {axis for known in layout.values() for axis in known}
+    for marker, known in layout.items():
+        if lacking := sorted(axes - known.keys()):
+            raise InputError(
+                f"{path}: marker {marker} has no column for {', '.join(lacking)}, other markers have: add it, or name "
+                "the columns under columns in scene.yaml if it was not measured"
+            )
     if not layout:
         raise InputError(f"{path}: no column is named like tip1_x_m: name them so, or say columns in scene.yaml")
     return layout, units, time
@@ -167,7 +182,7 @@ def _numbers(path: Path, body: list[tuple[int, list[str]]], k: int, column: str)
         try:
             out[i] = float(cell)
         except ValueError:
-            raise InputError(f"{path}: row {line}, column {column}: '{cell}' is not a number") from None
+            raise InputError(f"{path}: row {line}, column {column}: {quoted(cell)} is not a number") from None
         if np.isinf(out[i]):
             raise InputError(f"{path}: row {line}, column {column} is infinite: leave the cell empty for a gap")
     return out

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
 
+from masiv.bounds import LENGTH
 from masiv.errors import InputError
-from masiv.files import atomic, write_yaml
+from masiv.files import read_safetensors, write_safetensors, write_yaml
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
-from masiv.strict import read_yaml, validated
+from masiv.strict import read_yaml, reason, validated
 from masiv.tracks.placement import Placement
 from masiv.tracks.tracks import Clamp
 from masiv.twin.body import OFFSET_UNITS, Body, Boundary, InitialCondition, Release, TwinEffect
+from masiv.twin.plausible import check_plausible
 
 if TYPE_CHECKING:
     from masiv.materials.law import Law
@@ -183,8 +183,7 @@ def write_document(twin: Mapping[str, Any], folder: Path, name: str = TWIN_FILE)
             tensors[body.name] = np.ascontiguousarray(body.particles)
         bodies.append(_body_entry(body, law_file, particles_file))
     if tensors:
-        with atomic(folder / particles_file) as temporary:
-            save_file(tensors, temporary)
+        write_safetensors(folder / particles_file, tensors)
     boundary: Boundary = twin["boundary"]
     ground = None
     if boundary.ground is not None:
@@ -289,8 +288,14 @@ def read_document(
 ) -> dict[str, Any]:
     """The fields of the ``Twin`` in ``name`` in ``folder``; scene: see ``Twin.load``. Raises InputError."""
     path = folder / name
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"{folder} holds no {name}: run masiv identify")
+    twin = _fields(path, scene)
+    check_plausible(str(path), twin)
+    return twin
+
+
+def _fields(path: Path, scene: Callable[[], Mapping[str, Any]] | None) -> dict[str, Any]:
     data = read_yaml(path)
     if data.get("schema") == 1:
         from masiv.twin.schema1 import read_schema1
@@ -299,7 +304,7 @@ def read_document(
     if data.get("schema") != SCHEMA:
         raise InputError(f"{path} has schema {data.get('schema')}, this masiv reads 1 and {SCHEMA}: identify again")
     document = validated(Document, data, str(path))
-    bodies = tuple(_body(part, f"{path}: 'bodies.{k}", folder) for k, part in enumerate(document.bodies))
+    bodies = tuple(_body(part, f"{path}: 'bodies.{k}", path.parent) for k, part in enumerate(document.bodies))
     starts = tuple(_initial_condition(part) for part in document.initial_conditions)
     effects = tuple(read_effect(part, f"{path}: 'effects.{k}") for k, part in enumerate(document.effects))
     check_names(path, bodies, starts, effects)
@@ -362,11 +367,14 @@ def _check_law(part: LawPart, law: Law, where: str) -> None:
 def read_particles(path: Path, tensor: str) -> np.ndarray:
     """(Q, 3) [m]. Raises InputError if ``path`` does not hold finite positions under the name ``tensor``."""
     try:
-        particles = load_file(path)[tensor]
-    except (OSError, KeyError, SafetensorError) as error:
-        raise InputError(f"{path} does not hold the particles of body '{tensor}' ({error}): identify again") from error
-    if particles.ndim != 2 or particles.shape[1] != 3 or not np.isfinite(particles).all():
-        raise InputError(f"{path}: '{tensor}' of shape {particles.shape} must be finite positions (Q, 3)")
+        particles = read_safetensors(path)[0][tensor]
+    except (InputError, KeyError) as error:
+        raise InputError(
+            f"{path} does not hold the particles of body '{tensor}' ({reason(error, path)}): identify again"
+        ) from error
+    if particles.ndim != 2 or particles.shape[1] != 3 or not len(particles) or particles.dtype.kind != "f":
+        raise InputError(f"{path}: '{tensor}' of shape {particles.shape} must be positions (Q, 3) [m]")
+    LENGTH.check(float(np.abs(particles).max()), f"{path}: '{tensor}'")
     return particles
 
 

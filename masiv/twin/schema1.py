@@ -12,7 +12,7 @@ import numpy as np
 from masiv.errors import InputError
 from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
-from masiv.strict import validated
+from masiv.strict import shortened, validated
 from masiv.twin.body import Body, Boundary, InitialCondition, TwinEffect, with_start_values
 from masiv.twin.document import EffectPart, check_names, read_effect, read_particles
 
@@ -35,8 +35,8 @@ def read_schema1(data: Mapping[str, Any], path: Path, scene: Callable[[], Mappin
         if scene is None:
             raise InputError(f"{path} is of schema 1, which does not hold the bodies of tracks: load it with its scene")
         return _of_tracks(data, path, dict(scene()))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} is not a twin that can be read ({error}): run masiv identify") from error
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, IndexError) as error:
+        raise InputError(f"{path} is not a twin that can be read ({shortened(error)}): run masiv identify") from error
 
 
 def _of_video(data: Mapping[str, Any], path: Path) -> dict[str, Any]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from masiv.errors import InputError
+from masiv.strict import read_json
 
 if TYPE_CHECKING:
     from masiv.report.page import Page
@@ -21,8 +21,8 @@ def read_material(run: Path) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        data = read_json(path)
+    except InputError as error:
         raise InputError(f"{path} cannot be read ({error}): delete it and run masiv identify again") from error
     if not isinstance(data, dict) or data.get("schema") != 1:
         raise InputError(f"{path} is of another version of masiv: delete it and run masiv identify again")

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from masiv.errors import InputError
+from masiv.files import read_npz
 from masiv.refinement.answer import answer, outcome, words
 from masiv.refinement.support import question
 from masiv.report import plots
 from masiv.report.force_plot import force_in_time_and_space
 from masiv.report.page import Page, Share, number
+from masiv.strict import read_json
 
 REFINED, FIELDS = "refine.json", "refine.npz"
 PARTS = {"fit": "fitted", "validation": "validation", "test": "test"}
@@ -37,13 +37,13 @@ def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | No
     if not (run / REFINED).is_file() or not (run / FIELDS).is_file():
         return None
     try:
-        document = json.loads((run / REFINED).read_text(encoding="utf-8"))
-        with np.load(run / FIELDS, allow_pickle=False) as file:
-            first = str(file["observations"][0])
-            names = ("before", "after", "points", "times", "fit_count", "test_count")
-            fields = {name: file[f"{name}@{first}"] for name in names}
-            fields |= {name: file[f"{name}@{first}"] for name in FORCE if f"{name}@{first}" in file}
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        document = read_json(run / REFINED)
+        file = read_npz(run / FIELDS)
+        first = str(file["observations"][0])
+        names = ("before", "after", "points", "times", "fit_count", "test_count")
+        fields = {name: file[f"{name}@{first}"] for name in names}
+        fields |= {name: file[f"{name}@{first}"] for name in FORCE if f"{name}@{first}" in file}
+    except (InputError, KeyError, IndexError) as error:
         raise InputError(f"{run / REFINED} and {FIELDS} cannot be read ({error}): run masiv refine again") from error
     if not isinstance(document, dict) or document.get("schema") != 4:
         raise InputError(f"{run / REFINED} is of another version of masiv: run masiv refine again")
