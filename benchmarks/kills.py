@@ -167,8 +167,8 @@ def kill(scene: str, arguments: Sequence[str], after_s: float, draw: random.Rand
 def differences(run: Path, whole: Path) -> list[str]:
     """Names of files and arrays of ``run`` that differ from those of ``whole``, and of files that should not be there.
 
-    run.yaml, with times of day, and what says how long a stage took (log.csv, report.html, metrics.json of a video) are
-    not compared.
+    run.yaml, log.csv and report.html, with times of day and durations, and the effort that went into a result are not
+    compared.
     """
     names = {path.relative_to(folder) for folder in (run, whole) for path in folder.rglob("*") if path.is_file()}
     found = []
@@ -192,8 +192,8 @@ def _content(path: Path) -> object:
     if path.suffix == ".safetensors":  # the order of its metadata is random
         with safe_open(path, "np") as file:
             return file.metadata(), {name: file.get_tensor(name).tobytes() for name in sorted(file.keys())}
-    if path.name == "metrics.json":
-        return {key: value for key, value in json.loads(path.read_text()).items() if key != "seconds"}
+    if path.suffix == ".json":  # seconds and rollouts are the effort of the last process
+        return {k: v for k, v in json.loads(path.read_text()).items() if k not in ("seconds", "rollouts")}
     return path.read_bytes()
 
 
