@@ -46,7 +46,7 @@ from masiv.synth.spec import read_spec
 from masiv.twin import Twin
 
 BALLS = Path(__file__).parent / "golden" / "balls"
-MANY = settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+MANY = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 HOSTILE = (
     *(float("nan"), float("inf"), -float("inf"), 1e300, -1e300, 1e-300, 1e30, 0, -1, 1.5, 10**400),
     *(True, None, "", "1", "none", "../../x", "a" * 500, "\0", [], {}, [[]], [1, 2], [float("nan")] * 3, [0, 0, 0]),

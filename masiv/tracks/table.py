@@ -169,7 +169,7 @@ def _same(cell: str, value: str | int | float) -> bool:
         return cell == value
     try:
         return float(cell) == float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         return False
 
 
