@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-import yaml
 from cube import FRAMES, OMEGA, VELOCITY, VOLUME, Seen, motion_of, scene, settings
 from small import SMALL
 
 from masiv.checkpoint import Checkpoint
 from masiv.cli.main import run
+from masiv.config import load_config
 from masiv.errors import InputError
 from masiv.identification.neural.training import train
 from masiv.identification.neural.training_state import TrainingState
@@ -19,6 +19,7 @@ from masiv.identification.stage import identify
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.pretraining.pretrain import pretrained_path
+from masiv.runfolder import Request, RunFolder
 
 DROP = np.array([-0.3, -2.5, 0.1])
 """A faster release [m/s], which deforms the body more."""
@@ -126,9 +127,7 @@ def test_other_recordings_are_checked_before_anything_is_made(tmp_path, capsys, 
         assert said in " ".join(capsys.readouterr().err.split())
         assert not out.exists()
     unfinished = tmp_path / "unfinished"
-    unfinished.mkdir()
-    record = {"schema": 1, "config": {}, "scene": {}, "split": {}, "stages": {"trajectory": {"state": "running"}}}
-    (unfinished / "run.yaml").write_text(yaml.safe_dump(record))
+    RunFolder.create_or_resume(unfinished, Request(load_config().model_dump(mode="json"), tmp_path, {}, 2))
     monkeypatch.setattr("sys.argv", ["masiv", "identify", scene_path, "--out", str(out), "--also", str(unfinished)])
     with pytest.raises(SystemExit):
         run()
