@@ -296,7 +296,7 @@ def test_the_command_leaves_effects_out(tmp_path, monkeypatch, capfd):
     twin(DRAG, HIGH).save(run.path)
 
     def command(*more):
-        arguments = ["simulate", run.path, "--frames", 4, "--json", *more]
+        arguments = ["simulate", run.path, "--frames", 4, "--json", "--out", tmp_path / "novel", *more]
         monkeypatch.setattr(sys, "argv", ["masiv", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
             main.run()
