@@ -16,7 +16,8 @@ pytestmark = [
     pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds processes in /proc"),
 ]
 
-IN_TIME_S = 5
+IN_TIME_S = 30
+"""5 s are promised, and measured by benchmarks/kills.py; here a process that hangs is told from a busy machine."""
 BALLS = Path(__file__).parent / "golden" / "balls"
 MASIV = "from masiv.cli.supervisor import run; run()"
 IN_COMPILED_CODE = """
