@@ -846,7 +846,7 @@ def page(found: list[tuple[Case, Outcome]]) -> str:
         for case, outcome in found:
             form = re.sub(r"(\S*/)+|[^a-z ]", "", outcome.said)[:45]
             if case.group == group and (form not in known or not outcome.passes(case)):
-                lines.append(row(case, outcome, 84))
+                lines.append(row(case, outcome, 48))
             known |= {form} if case.group == group else set()
     return "\n".join(lines) + "\n"
 
