@@ -86,11 +86,7 @@ class RunFolder:
     def create_or_resume(cls, path: Path, request: Request) -> RunFolder:
         """A new run, or an existing one that was asked the same. Raises InputError saying what differs."""
         known = (path / "run.yaml").is_file()
-        if (
-            not known
-            and path.exists()
-            and (not path.is_dir() or any(not p.name.startswith("lock.") for p in path.iterdir()))
-        ):
+        if not known and path.exists() and not _is_empty(path):
             raise InputError(f"{path} exists and is not a run folder: give another one with --out")
         try:
             path.mkdir(parents=True, exist_ok=True)

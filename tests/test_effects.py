@@ -47,6 +47,25 @@ def test_absent_at_zero_strength(name):
     torch.testing.assert_close(positions(theta, effect, x), without, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", sorted(effects()))
+def test_a_substep_in_several_launches_is_that_in_one(name, monkeypatch):
+    """Large bodies take several launches a substep."""
+    effect, x = effects()[name], body()
+    whole = positions(present(effect), effect, x)
+    monkeypatch.setattr("masiv.mpm.taped_rollout.SERIAL_PARTICLES", 0)
+    torch.testing.assert_close(positions(present(effect), effect, x), whole, rtol=0, atol=1e-11)
+
+
+def test_the_order_of_effects_changes_nothing():
+    library, x = effects(), body()
+    members = [(library[n], present(library[n])) for n in ("viscosity", "linear_drag", "swirl", "body_force")]
+    ends = [
+        rollout(simulator(len(x)), LAW, thrown_body(x), STEPS, [STEPS], ActiveEffects(tuple(order), setting(x)))
+        for order in (members, members[::-1])
+    ]
+    torch.testing.assert_close(ends[0], ends[1], rtol=0, atol=0)
+
+
 CASES = [(name, "sticky") for name in effects()]
 CASES += [(name, c) for name, e in effects().items() if isinstance(e, ContactEffect) for c in ("release", "slip")]
 

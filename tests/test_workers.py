@@ -29,7 +29,7 @@ from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
 from masiv.observations.motion import SampledMotion
 from masiv.refinement.baselines import ALL_FRAMES_STAGE, baselines, differentiated
-from masiv.refinement.hypotheses import Linearizations, linearized
+from masiv.refinement.hypotheses import Linearizations, linearized, nearly_linearized, weighed
 from masiv.refinement.tasks import map_tasks, rank
 from masiv.workers import TaskError, Workers, process_count, unwrap
 
@@ -308,3 +308,13 @@ def test_models_are_linearised_once(two):
     assert again is first
     assert list(known.each(model, fits)) == [again, other]
     assert model.rollouts == before + taken
+
+
+def test_evidence_by_derivatives_of_the_model_without_an_effect_is_exact_if_motion_is_linear():
+    model = LinearModel({"linear_drag": 0.3})
+    base, fit = baseline(model), baseline(model, ["linear_drag"])
+    rough, exact = nearly_linearized(model, fit, linearized(model, base)), linearized(model, fit)
+    assert [p.name for p in rough.parameters] == [p.name for p in exact.parameters]
+    np.testing.assert_allclose(rough.jacobians[0], exact.jacobians[0], atol=1e-9)
+    one, other = (weighed(model, [(fit, line)])[0].marginal.log_evidence for line in (rough, exact))
+    assert one == pytest.approx(other, abs=1e-6)

@@ -41,9 +41,9 @@ class BoundEffects:
         self.empty = not self.members and self.force is None
         self._known: list[KernelEffect] = []
         if effects is None or self.empty:
-            from masiv.kernels.forward_effects import NoEffects
+            from masiv.kernels.forward_effects import no_effects
 
-            self.forward: Any = mpm.attached(NoEffects, lambda: NoEffects(mpm))
+            self.forward: Any = no_effects(mpm)
         else:
             self._known = _compiled_together(self.members)
             self.forward = _forward_effects(mpm, self._known, effects.context)

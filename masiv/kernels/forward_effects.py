@@ -25,6 +25,11 @@ class NoEffects:
         pass
 
 
+def no_effects(mpm):
+    """The ``NoEffects`` of ``mpm``."""
+    return mpm.attached(NoEffects, lambda: NoEffects(mpm))
+
+
 @ti.data_oriented
 class ForwardEffects:
     """Functions of effects (``masiv.effects.effect``), each with its number of coefficients: on the nodes, on the nodes

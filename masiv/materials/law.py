@@ -66,9 +66,9 @@ class SharedBoundLaw(BoundLaw):
         self.kernels.forward(s, count)
 
     def p2g(self, mpm: MpmKernels, s: int, count: int, nodes: int) -> None:
-        from masiv.kernels.forward_effects import NoEffects
+        from masiv.kernels.forward_effects import no_effects
 
-        whole = self.substeps(mpm, mpm.attached(NoEffects, lambda: NoEffects(mpm)), True)
+        whole = self.substeps(mpm, no_effects(mpm), True)
         if whole is None:
             super().p2g(mpm, s, count, nodes)
         else:

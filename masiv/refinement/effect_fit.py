@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from masiv.errors import NonFiniteError
-from masiv.inference.least_squares import Linearization, broyden, derivative, gauss_newton_jump
+from masiv.inference.least_squares import Linearization, broyden, derivatives, gauss_newton_jump
 from masiv.inference.model_fit import (
     ModelFit,
     best_strength,
@@ -135,7 +135,7 @@ class _EffectFit:
         every = [*self.guessed_parameters, *extra]
         known, here = len(self.guessed_parameters), self.here
         for _ in range(2):
-            columns = [derivative(residual, here.values, here.residual, p) for p in extra]
+            columns = derivatives(residual, here.values, here.residual, extra)
             wide = np.column_stack([here.jacobian[:, :known], *columns])
             here = broyden(
                 residual, every, Linearization(here.values, here.residual, wide),

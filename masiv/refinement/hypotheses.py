@@ -21,8 +21,8 @@ UNKNOWN = "something unknown"
 CREDIBLE = 0.95
 """Probability of the smallest set of answers that is reported."""
 NEGLIGIBLE = 12.0
-"""Logarithm of the odds against a model beyond which it decides nothing: with derivatives that are off by a tenth, its
-evidence is known to a few units."""
+"""Logarithm of the odds against a model beyond which it decides nothing. Chosen: with derivatives of the model without
+the effect, the evidence of four effects of one elastic body was off by 0.5 to 2.3."""
 
 
 Linearized = tuple[ModelFit, LinearModel]
