@@ -22,6 +22,7 @@ import tempfile
 import time
 
 SIDE, DT, STEPS = 0.5, 2e-4, 100
+DRAG = "neo_hookean, linear drag"
 
 
 def body(count):
@@ -47,6 +48,7 @@ def time_masiv(law_name, count, repeats, arch):
     from masiv.mpm.simulator import Simulator
     from masiv.pretraining.pretrain import pretrained_path
 
+    effects = None
     law = ClassicalLaw("neo_hookean", youngs_modulus=1e5, poissons_ratio=0.3)
     if law_name == "neural":
         law = load_law(pretrained_path("jelly"))
@@ -54,14 +56,22 @@ def time_masiv(law_name, count, repeats, arch):
     simulator = Simulator(particle_count=count, spacing=spacing, substep=DT, volume=SIDE**3, density=1e3,
                           gravity=(0, -9.8, 0), max_substeps=STEPS, grid_nodes=1 << 18)  # fmt: skip
     x = body(count).requires_grad_()
+    if law_name == DRAG:
+        from masiv.effects.active import ActiveEffects
+        from masiv.effects.catalogue import effect_named
+        from masiv.effects.context import EffectContext
+
+        gravity = torch.tensor([0.0, -9.8, 0.0])
+        context = EffectContext(gravity, x.detach(), 1e3 * SIDE**3 / count, SIDE, STEPS * DT, DT)
+        effects = ActiveEffects(((effect_named("linear_drag"), torch.tensor([0.5])),), context)
     velocity = torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
     still = torch.zeros(count, 3, 3)
-    rollout(simulator, law, at_rest(x, velocity, still), 1, [1]).sum().backward()
+    rollout(simulator, law, at_rest(x, velocity, still), 1, [1], effects).sum().backward()
     first = time.perf_counter() - began
     forward, both = [], []
     for _ in range(repeats):
         start = time.perf_counter()
-        end = rollout(simulator, law, at_rest(x, velocity, still), STEPS, [STEPS])
+        end = rollout(simulator, law, at_rest(x, velocity, still), STEPS, [STEPS], effects)
         middle = time.perf_counter()
         end.square().sum().backward()
         forward.append(middle - start)
@@ -162,8 +172,8 @@ def main():
     print("starting Taichi to the first gradient, with an empty and with a filled kernel cache.\n")
     print("| law | particles | forward | forward + backward | spread | first call, cold | warm | peak memory |")
     print("|---|---|---|---|---|---|---|---|")
-    for count in (5000,) if options.quick else (1000, 5000, 50000):
-        for kind in ("neo_hookean", "neural", "plain"):
+    for count in (5000,) if options.quick else (1000, 1500, 5000, 50000):
+        for kind in ("neo_hookean", DRAG, "neural", "plain"):
             repeats = 9 if count < 20000 else 3
             with tempfile.TemporaryDirectory() as cache:
                 cold = measure(kind, count, 1, options.arch, cache)
