@@ -274,6 +274,11 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
     for a, b in zip(ranking, other, strict=True):
         assert a.theta == b.theta
         np.testing.assert_array_equal(a.columns, b.columns)
+    alone, beside = (simulation.with_workers(w).finer_grids(model, values, 0) for w in (Workers(1), two))
+    assert len(alone) == len(simulation.setups[0].finer) >= 2
+    for a, b in zip(alone, beside, strict=True):
+        assert a.any()
+        np.testing.assert_array_equal(a, b)
 
 
 def test_derivatives_in_two_processes_are_those_of_one(two):

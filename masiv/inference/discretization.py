@@ -27,7 +27,7 @@ def with_residual_std(
     missing. That is the error of the observation, ``observation_std`` (T,) [m], and by how much one more grid may
     differ from the others in what no fit absorbs; in free flight that is nothing.
 
-    It does not fall as time goes on, since errors of the simulation grow. Raises NonFiniteError.
+    It does not fall as time goes on, since errors of the simulation grow. Raises MasivError.
     """
     observations = forward_model.observations
     changes = [forward_model.finer_grids(fitted.model, fitted.values, k) for k in range(len(observations))]

@@ -181,7 +181,7 @@ class ForwardModel(ABC):
 
     def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
         """What each of two or more finer grids changes (T, N, A) [m] of recording ``index``. Empty if there is no grid,
-        or if its change says nothing; all recordings have as many. Raises NonFiniteError."""
+        or if its change says nothing; all recordings have as many. Raises MasivError."""
         return []
 
     def reset_initial_conditions(self, values: Mapping[str, float]) -> dict[str, float]:

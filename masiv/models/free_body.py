@@ -21,6 +21,7 @@ from masiv.models.initial_state import InitialState, initial_state_parameters
 from masiv.models.parameters import Parameter
 from masiv.observations.video import VideoObservation
 from masiv.scene.transforms import SimulationFrame
+from masiv.workers import unwrap
 
 GRID_CORRECTION = "grid_change"
 """Parameter ``grid_change@recording``: how much there is of the mean of its grid corrections."""
@@ -211,14 +212,23 @@ class FreeBodyModel(ForwardModel):
             out.append(field)
         return out
 
-    @torch.no_grad()
     def finer_grids(self, model: Model, values: Mapping[str, float], index: int) -> list[np.ndarray]:
-        """See ``ForwardModel``: each with all particles."""
+        """See ``ForwardModel``: each with all particles. Grids are simulated in several processes."""
         r = self.setups[index]
-        own = self.positions(model, values, index, r.body.frames)
-        law, start = law_of(model.family, values), self.initial_state(values, index)
-        runs = (
-            finer.run(law, start, model.contact, r.body.frames, None, self.active(model, values, finer))
-            for finer in r.finer
-        )
-        return [(run[:, r.body.chosen] - own).double().numpy() for run in runs]
+        own = self.positions(model, values, index, r.body.frames).double()
+        tasks = [(model, values, index, grid) for grid in range(len(r.finer))]
+        found = [unwrap(run) for run in self.workers.map(_finer_positions, tasks, shared=(self,))]
+        return [(run - own).numpy() for run in found]
+
+
+@torch.no_grad()
+def _finer_positions(
+    forward_model: FreeBodyModel, model: Model, values: Mapping[str, float], index: int, grid: int
+) -> torch.Tensor:
+    """Positions (T, N, 3) [m, simulation axes] of recording ``index`` on one of its finer grids. Raises
+    NonFiniteError."""
+    r = forward_model.setups[index]
+    law, start = law_of(model.family, values), forward_model.initial_state(values, index)
+    effects = forward_model.active(model, values, r.finer[grid])
+    run = r.finer[grid].run(law, start, model.contact, r.body.frames, None, effects)
+    return run[:, r.body.chosen].double()

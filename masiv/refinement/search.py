@@ -9,7 +9,7 @@ from dataclasses import replace
 from masiv.errors import MasivError
 from masiv.inference.discretization import with_residual_std
 from masiv.inference.evidence import Evidence
-from masiv.inference.model_fit import ModelFit, rank_by_bic, refit_whitened, warm_started_fit
+from masiv.inference.model_fit import ModelFit, rank_by_bic, refit_whitened
 from masiv.inference.predictive import forecast, predictive_p
 from masiv.inference.robust import robust_scale_of
 from masiv.models.base import ForwardModel
@@ -118,8 +118,10 @@ def _add_effects(
         if done.accepted is None:
             # Standard errors are those of the posterior; the model is the one that the last round confirmed.
             return state.with_fit(done.base), rounds
-        state = state.with_fit(done.accepted.fitted).whitened_again()
-        bases = [state.fit, *_rivals(state, done)]
+        settings.progress("refine: fit whitened residuals", 0, 1, "")
+        state, rivals = state.with_fit(done.accepted.fitted).whitened_again(_rivals(done), settings.workers)
+        settings.progress("refine: fit whitened residuals", 1, 1, "")
+        bases = [state.fit, *rivals]
     return state, rounds
 
 
@@ -161,20 +163,21 @@ def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperL
     return 1 / (1 + odds)
 
 
-def _rivals(state: SearchState, done: Round) -> list[ModelFit]:
-    """What may act in place of what was accepted, with the same law."""
+def _rivals(done: Round) -> list[ModelFit]:
+    """What may act in place of what was accepted, with the same law; most probable first."""
     assert done.accepted is not None
     assert done.posterior is not None
     here = done.accepted.fitted.model
-    out = []
-    for h in done.posterior.hypotheses:
-        other = len(h.effects) == len(here.effects) and h.effects != frozenset(here.effects)
-        if other and h.law == here.family.kind and h.effects in done.posterior.credible_set():
-            try:
-                out.append(warm_started_fit(state.forward_model, h.fitted, state.robust_scale))
-            except MasivError:
-                continue
-    return out[:RIVALS]
+    credible = done.posterior.credible_set()
+    own = [
+        (p, h.fitted)
+        for h, p in zip(done.posterior.hypotheses, done.posterior.probabilities, strict=True)
+        if h.law == here.family.kind
+        and len(h.effects) == len(here.effects)
+        and h.effects != frozenset(here.effects)
+        and h.effects in credible
+    ]
+    return [fitted for _, fitted in sorted(own, key=lambda pair: -pair[0])[:RIVALS]]
 
 
 def _check(state: SearchState, fitted: ModelFit, settings: SearchSettings) -> Check:

@@ -14,7 +14,8 @@ from masiv.models.base import ForwardModel, Model
 from masiv.progress import Progress, silent
 from masiv.refinement.config import RefineConfig
 from masiv.refinement.hypotheses import Linearizations
-from masiv.workers import Workers
+from masiv.refinement.tasks import map_tasks
+from masiv.workers import TaskError, Workers, unwrap
 
 
 @dataclass(frozen=True)
@@ -80,14 +81,17 @@ class SearchState:
     def with_fit(self, fit: ModelFit) -> SearchState:
         return replace(self, fit=fit)
 
-    def whitened_again(self) -> SearchState:
+    def whitened_again(self, rivals: Sequence[ModelFit], workers: Workers) -> tuple[SearchState, list[ModelFit]]:
         """With ``residual_std`` as ``fit`` moves, and ``fit`` refitted if that changes it: with an effect the body may
-        touch what it did not, earlier than before, and what a finer grid changes is another. Raises NonFiniteError."""
+        touch what it did not, earlier than before, and what a finer grid changes is another. And ``rivals`` refitted,
+        but for those that cannot be simulated. Raises MasivError."""
         updated = with_residual_std(self.forward_model, self.fit, self.observation_std)
-        if same_residual_std(updated, self.forward_model):
-            return replace(self, forward_model=updated)
-        fit = warm_started_fit(updated, self.fit, self.robust_scale)
-        return replace(self, forward_model=updated, fit=fit)
+        own = [] if same_residual_std(updated, self.forward_model) else [self.fit]
+        tasks = [(fit, self.robust_scale) for fit in (*own, *rivals)]
+        refitted = list(map_tasks(workers, updated, warm_started_fit, tasks))
+        fit = unwrap(refitted[0]) if own else self.fit
+        others = [other for other in refitted[len(own) :] if not isinstance(other, TaskError)]
+        return replace(self, forward_model=updated, fit=fit), others
 
 
 def same_residual_std(one: ForwardModel, other: ForwardModel) -> bool:
