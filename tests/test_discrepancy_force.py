@@ -20,8 +20,10 @@ from masiv.inference.gaussian_prior import most_probable
 from masiv.observations.motion import SampledMotion
 from masiv.refinement.config import RefineConfig
 from masiv.refinement.discrepancy import DISCREPANCY_FORCE, discrepancy_force
-from masiv.refinement.document import arrays, document, text
+from masiv.refinement.document import document
+from masiv.refinement.document_text import text
 from masiv.refinement.from_video import Recording, refine_recordings
+from masiv.refinement.residual_arrays import arrays
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.stage import refine
 from masiv.scene.transforms import SimulationFrame

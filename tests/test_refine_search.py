@@ -13,13 +13,14 @@ from masiv.inference.noise_model import NoiseModel
 from masiv.models.families import Family
 from masiv.refinement.candidates import score
 from masiv.refinement.config import RefineConfig
-from masiv.refinement.document import document, text
+from masiv.refinement.document import document
+from masiv.refinement.document_text import text
 from masiv.refinement.effect_fit import fit_with_effect
 from masiv.refinement.rounds import Trial
 from masiv.refinement.search import whitened_start
-from masiv.refinement.search_round import could_improve
 from masiv.refinement.search_state import SearchSettings
 from masiv.refinement.stage import refine
+from masiv.refinement.trials import could_improve
 
 DRAG, GRAVITY = {"linear_drag.strength": 0.5}, {"gravity_scale.strength": 0.4}
 

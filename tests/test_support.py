@@ -17,7 +17,8 @@ from masiv.identification.flights import fit_flights
 from masiv.models.point_mass import PointMassModel
 from masiv.observations.tracks import flight_noise
 from masiv.refinement.config import RefineConfig
-from masiv.refinement.document import document, text
+from masiv.refinement.document import document
+from masiv.refinement.document_text import text
 from masiv.refinement.search_state import SearchSettings
 from masiv.refinement.stage import refine
 from masiv.refinement.support import carried_weight

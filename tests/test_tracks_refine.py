@@ -31,9 +31,10 @@ from masiv.models.marked_body import marked_body
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.refinement.candidates import score
 from masiv.refinement.config import RefineConfig
-from masiv.refinement.document import arrays, document
+from masiv.refinement.document import document
 from masiv.refinement.effect_fit import fit_with_effect
 from masiv.refinement.from_tracks import refine_tracks
+from masiv.refinement.residual_arrays import arrays
 from masiv.refinement.search_state import SearchSettings
 from masiv.refinement.stage import refine
 from masiv.refinement.to_twin import refined_twin

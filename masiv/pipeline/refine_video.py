@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Progress) -> Summary:
     """Refine the first of ``runs`` jointly with the others; writes refine.json, refine.npz, the report and, if an
     effect is accepted, the new twin and what it gives."""
-    from masiv.refinement.document import text
+    from masiv.refinement.document_text import text
     from masiv.refinement.from_video import refine_recordings
     from masiv.twin.identified import load_identified
 
@@ -65,7 +65,7 @@ def _save(
 ) -> dict[str, Any]:
     from masiv.observations.video import VideoObservation
     from masiv.refinement.document import document as document_of
-    from masiv.refinement.document import save_arrays
+    from masiv.refinement.residual_arrays import save_arrays
     from masiv.refinement.to_twin import baseline_twin, refined_twin
     from masiv.simulation.rollout import Rollout
     from masiv.simulation.simulate import simulate

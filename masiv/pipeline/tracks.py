@@ -123,8 +123,10 @@ class TracksRun(Run):
             return self._refine(request, progress)
 
     def _refine(self, request: RefineRequest, progress: Progress) -> Summary:
-        from masiv.refinement.document import document, save_arrays, text
+        from masiv.refinement.document import document
+        from masiv.refinement.document_text import text
         from masiv.refinement.from_tracks import refine_tracks
+        from masiv.refinement.residual_arrays import save_arrays
         from masiv.refinement.to_twin import refined_twin
         from masiv.twin.identified import load_to_refine, save_refined
 
@@ -217,7 +219,7 @@ class TracksRun(Run):
         """Simulate every run with the twin, and with the one before refine if there is one; metrics.json, rollout.npz,
         report.html. Returns the errors of each run."""
         from masiv.identification.twin_over_runs import run_errors, simulate_runs
-        from masiv.refinement.document import with_scopes
+        from masiv.refinement.document_text import with_scopes
         from masiv.report.tracks import write_report
         from masiv.twin.identified import IDENTIFIED_FILE, load_identified
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 from masiv.effects.catalogue import effect_named
 from masiv.errors import MasivError
@@ -12,13 +12,10 @@ from masiv.inference.model_fit import (
     ModelFit,
     gauss_newton_fit,
     held_parameters,
-    linear_strengths,
     rank_by_bic,
-    warm_started_fit,
 )
 from masiv.models.base import EffectTerm, ForwardModel
-from masiv.refinement.candidates import Candidate, Ranking
-from masiv.refinement.effect_fit import MIN_PROMISE_KEPT, fit_with_effect
+from masiv.refinement.candidates import Ranking
 from masiv.refinement.hypotheses import (
     NEGLIGIBLE,
     Hypothesis,
@@ -28,82 +25,32 @@ from masiv.refinement.hypotheses import (
     nearly_linearized,
     weighed,
 )
-from masiv.refinement.rounds import Failure, Round, Trial, rank_trials
+from masiv.refinement.refits import refit_simpler, refit_unconverged, restart_base
+from masiv.refinement.rounds import Round, Trial, rank_trials
 from masiv.refinement.search_state import SearchSettings, SearchState
-from masiv.refinement.tasks import map_tasks, rank
+from masiv.refinement.tasks import map_tasks
+from masiv.refinement.trials import Attempts, converged, try_effects
 from masiv.workers import TaskError
-
-FALSE_MINIMUM_RATIO = 0.5
-"""A model with one more effect that has less than this part of its base's cost may have got out of a false minimum."""
-MAX_PROMISE_ERROR = 1.5
-"""Factor by which a ranking, which is linear, may have underestimated an effect."""
-LONGER_BUDGET = 3
-"""Derivatives that a fit may take that has not reached what the ranking promised."""
-WIDER_REDUCED_CHI = 1.2
-"""Residual of the best trial over its standard deviation above which twice as many effects are fitted."""
 
 
 def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSettings) -> Round:
     """Add one effect to ``state.fit``. bases: fits without that effect to start from, the first to be ranked in
     full."""
-    attempts = _try_effects(state, bases, settings)
+    attempts = try_effects(state, bases, settings)
     trials, current = rank_trials(attempts.trials), state.fit
     if trials:
-        trials = rank_trials(_refit_simpler(state, trials, settings))
-        trials = rank_trials(_refit_unconverged(state, trials, bases, settings))
+        trials = rank_trials(refit_simpler(state, trials, settings))
+        trials = rank_trials(refit_unconverged(state, trials, bases, settings))
         if current.model.effects:
-            current = _restart_base(state, trials[0].fitted)
+            current = restart_base(state, trials[0].fitted)
     ranking = _with_inapplicable(state, attempts.ranking, settings)
     if settings.rank_only:
         return Round(current, ranking, (), None, failures=attempts.failures)
     trials = [
-        replace(t, impossible=tuple(reasons_against(state.forward_model, t)), converged=_converged(t, bases))
+        replace(t, impossible=tuple(reasons_against(state.forward_model, t)), converged=converged(t, bases))
         for t in trials
     ]
     return _judged(state.with_fit(current), bases, trials, replace(attempts, ranking=ranking), settings)
-
-
-# -- ranking and fitting ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Attempts:
-    """ranking: of the first base."""
-
-    ranking: Ranking = field(default_factory=Ranking)
-    trials: tuple[Trial, ...] = ()
-    failures: tuple[Failure, ...] = ()
-
-    def with_fits(self, fits: tuple[list[Trial], list[Failure]]) -> _Attempts:
-        return replace(self, trials=(*self.trials, *fits[0]), failures=(*self.failures, *fits[1]))
-
-
-def _try_effects(state: SearchState, bases: Sequence[ModelFit], settings: SearchSettings) -> _Attempts:
-    """Of each base, the effects that explain most, fitted."""
-    out = _Attempts()
-    for base in bases:
-        worth = [c.effect for c in out.ranking.candidates if c.explained >= settings.config.min_explained]
-        if out.ranking.candidates and not worth:
-            break
-        # What the first base's ranking leaves out is not looked at again for the next base.
-        names = worth[: settings.shortlist] or settings.considered(state.forward_model, base.model)
-        start = _Start.of(state, base)
-        ranking = _ranked(start, names, settings)
-        first = not out.ranking.candidates
-        if first:
-            out = replace(out, ranking=ranking)
-        if settings.rank_only:
-            break
-        candidates = [c for c in ranking.candidates if c.explained >= settings.config.min_explained]
-        shortlist = [
-            c for c in candidates[: settings.shortlist] if start.curriculum or could_improve(c, base, out.trials)
-        ]
-        out = out.with_fits(_fitted_trials(start, shortlist, settings))
-        if first and _needs_wider_shortlist(state, out.trials):
-            # The ranking is linear: an effect that acts at a place may be far down in it.
-            wider = candidates[settings.shortlist : 2 * settings.shortlist]
-            out = out.with_fits(_fitted_trials(start, wider, settings))
-    return out
 
 
 def _with_inapplicable(state: SearchState, ranking: Ranking, settings: SearchSettings) -> Ranking:
@@ -112,204 +59,6 @@ def _with_inapplicable(state: SearchState, ranking: Ranking, settings: SearchSet
     known = {state.forward_model.term(n).effect for n in (*effects, *state.forward_model.candidates(state.fit.model))}
     others = {n: "it cannot act here in addition" for n in settings.config.effects if n not in known}
     return replace(ranking, not_ranked={**ranking.not_ranked, **others})
-
-
-@dataclass(frozen=True)
-class _Start:
-    """Where refits of one base start. curriculum: shorter forward models through which they go first, if the base is so
-    far off at the end that its derivatives point nowhere; fit: the base in the first of these."""
-
-    forward_model: ForwardModel
-    curriculum: tuple[ForwardModel, ...]
-    fit: ModelFit
-    robust_scale: float
-
-    @classmethod
-    def of(cls, state: SearchState, base: ModelFit) -> _Start:
-        model = state.forward_model
-        curriculum, fit = tuple(model.curriculum(base.fields)), base
-        if curriculum:  # what comes late in such a motion draws a fit of all of it away from the beginning, too
-            values = model.reset_initial_conditions(base.values)
-            fit = warm_started_fit(curriculum[0], replace(base, values=values), state.robust_scale)
-        return cls(model, curriculum, fit, state.robust_scale)
-
-
-def _ranked(start: _Start, names: Sequence[str], settings: SearchSettings) -> Ranking:
-    label = f"refine: rank effects, {start.fit.model.family.kind}"
-    ranking = rank(
-        settings.workers, start.curriculum[0] if start.curriculum else start.forward_model, start.fit, names,
-        robust_scale=start.robust_scale, progress=lambda n, i, k: settings.progress(label, i, k, n),
-    )  # fmt: skip
-    settings.progress(label, 1, 1, ranking.candidates[0].effect if ranking.candidates else "none")
-    return ranking
-
-
-def _fitted_trials(
-    start: _Start, candidates: Sequence[Candidate], settings: SearchSettings
-) -> tuple[list[Trial], list[Failure]]:
-    """The start with each of the ``candidates``, and those that cannot be simulated."""
-    law = start.fit.model.family.kind
-    tasks = [(start.curriculum, start.fit, candidate, start.robust_scale) for candidate in candidates]
-    fits = map_tasks(settings.workers, start.forward_model, _fit_through_curriculum, tasks)
-    return trials_of(f"refine: fit effects, {law}", law, candidates, fits, settings)
-
-
-def trials_of(
-    label: str,
-    law: str,
-    candidates: Sequence[Candidate],
-    fits: Iterable[ModelFit | TaskError],
-    settings: SearchSettings,
-) -> tuple[list[Trial], list[Failure]]:
-    """Trials of ``fits`` (``ModelFit`` or ``TaskError``) of ``candidates``, and what failed; progress is told."""
-    trials, failures = [], []
-    settings.progress(label, 0, len(candidates), ", ".join(c.effect for c in candidates))
-    for done, (candidate, fitted) in enumerate(zip(candidates, fits, strict=True)):
-        note = candidate.effect
-        if isinstance(fitted, TaskError):
-            failures.append(Failure(candidate.effect, law, fitted.reason))
-            note += f": {fitted.reason}"
-        else:
-            trials.append(Trial(candidate, fitted))
-            note += f": {fitted.fit_mm:.1f} mm"
-        settings.progress(label, done + 1, len(candidates), note)
-    return trials, failures
-
-
-def _fit_through_curriculum(
-    forward_model: ForwardModel,
-    curriculum: Sequence[ForwardModel],
-    start: ModelFit,
-    candidate: Candidate,
-    robust_scale: float,
-) -> ModelFit:
-    """``start`` with the candidate, through the ``curriculum`` first."""
-    fitted = fit_with_effect(curriculum[0] if curriculum else forward_model, start, candidate, robust_scale)
-    for longer in (*curriculum[1:], forward_model) if curriculum else ():
-        fitted = warm_started_fit(longer, fitted, robust_scale)
-    return fitted
-
-
-def _needs_wider_shortlist(state: SearchState, trials: Sequence[Trial]) -> bool:
-    """Whether the best of ``trials`` leaves more than noise and discretization explain."""
-    if not trials:
-        return False
-    best = min((t.fitted for t in trials), key=lambda f: f.cost)
-    return state.noise.reduced_chi(best.squares) > WIDER_REDUCED_CHI
-
-
-def could_improve(candidate: Candidate, base: ModelFit, trials: Sequence[Trial]) -> bool:
-    """Whether ``candidate``, if it explains MAX_PROMISE_ERROR times what the ranking says, would be as good as the best
-    of ``trials``: a law that explains the motion worse need not be fitted with what would not make up for that."""
-    best = min((t.fitted.cost for t in trials), default=math.inf)
-    return base.cost * (1 - min(MAX_PROMISE_ERROR * candidate.explained, 1.0)) <= best
-
-
-# -- refits from where the best one ended ----------------------------------------------------------------------------
-
-
-def _refit_simpler(state: SearchState, trials: Sequence[Trial], settings: SearchSettings) -> list[Trial]:
-    """Trials, best first, of which those that are simpler than the best one, with the same law, are fitted again from
-    where that ended: a flexible effect that found the right law and initial state must not win for that alone. So too
-    an effect that is not smooth and no richer: its derivatives at a law that made up for it point to next to
-    nothing."""
-    model, best = state.forward_model, trials[0].fitted
-
-    def worth(trial: Trial) -> bool:
-        own, its = len(trial.fitted.parameters), len(best.parameters)
-        nonsmooth = model.term(trial.effect).nonsmooth
-        return trial.law == best.model.family.kind and (own < its or (own == its and nonsmooth))
-
-    simpler = [t for t in trials[1:] if worth(t)]
-    tasks = [(t.fitted, t.effect, best, state.robust_scale) for t in simpler]
-    again: dict[int, ModelFit] = {}
-    for done, (trial, fit) in enumerate(
-        zip(simpler, map_tasks(settings.workers, model, _refit_from, tasks), strict=True)
-    ):
-        settings.progress("refine: fit simpler effects again", done + 1, len(simpler), trial.effect)
-        if not isinstance(fit, TaskError):
-            again[id(trial)] = min(fit, trial.fitted, key=lambda f: f.cost)
-    return [replace(t, fitted=again.get(id(t), t.fitted)) for t in trials]
-
-
-def _refit_from(
-    forward_model: ForwardModel, fitted: ModelFit, name: str, best: ModelFit, robust_scale: float
-) -> ModelFit:
-    """``fitted``, a model with the term ``name``, from where what it shares with ``best`` ended. Raises
-    NonFiniteError."""
-    term = forward_model.term(name)
-    shared = {p.name for p in fitted.parameters} & {p.name for p in best.parameters}
-    values = {**fitted.values, **{n: best.values[n] for n in shared}}
-    values = linear_strengths(forward_model, fitted.model, values, term.strengths, robust_scale)
-    # An effect that is not smooth starts far from where it ends: four derivatives for two.
-    budget = (4 if term.nonsmooth else 2) * (len(fitted.parameters) + 2)
-    return gauss_newton_fit(
-        forward_model, fitted.model, values, budget=budget, robust_scale=robust_scale,
-        held=held_parameters(forward_model, fitted),
-    )  # fmt: skip
-
-
-def _refit_unconverged(
-    state: SearchState, trials: Sequence[Trial], bases: Sequence[ModelFit], settings: SearchSettings
-) -> list[Trial]:
-    """Trials, best first, of which those that have not reached what the ranking promised go on with fresh derivatives:
-    from where they ended, and from where the best with the same law did. Those that would not be as good as the best
-    trial if they kept their promise do not."""
-    own = {b.model.family.kind: b for b in reversed(bases)}
-    failed = [t for t in trials if not _converged(t, bases) and could_improve(t.candidate, own[t.law], trials)]
-    best = {law: next(t.fitted for t in trials if t.law == law) for law in {t.law for t in trials}}
-    tasks = [(t.fitted, best[t.law], state.robust_scale) for t in failed]
-    again: dict[int, ModelFit] = {}
-    results = map_tasks(settings.workers, state.forward_model, _refit_longer, tasks)
-    for done, (trial, fit) in enumerate(zip(failed, results, strict=True)):
-        settings.progress("refine: fit again what fell short", done + 1, len(failed), trial.effect)
-        if not isinstance(fit, TaskError):
-            again[id(trial)] = min(fit, trial.fitted, key=lambda f: f.cost)
-    return [replace(t, fitted=again.get(id(t), t.fitted)) for t in trials]
-
-
-def _refit_longer(forward_model: ForwardModel, fitted: ModelFit, best: ModelFit, robust_scale: float) -> ModelFit:
-    """The better of ``fitted`` fitted on, and from what it shares with ``best``. Raises MasivError if neither start can
-    be simulated."""
-    own = {p.name for p in fitted.parameters}
-    shared = {p.name: best.values[p.name] for p in best.parameters if p.name in own}
-    starts = [fitted.values] if best is fitted else [fitted.values, {**fitted.values, **shared}]
-    fits: list[ModelFit] = []
-    failed: MasivError | None = None
-    for values in starts:
-        try:
-            fits.append(
-                gauss_newton_fit(
-                    forward_model, fitted.model, values, budget=LONGER_BUDGET * (len(fitted.parameters) + 2),
-                    robust_scale=robust_scale, held=held_parameters(forward_model, fitted),
-                )
-            )  # fmt: skip
-        except MasivError as error:
-            failed = error
-    if not fits:
-        assert failed is not None
-        raise failed
-    return min(fits, key=lambda f: f.cost)
-
-
-def _restart_base(state: SearchState, best: ModelFit) -> ModelFit:
-    """``state.fit``, or that fit from what it shares with ``best``, a model with one more effect, if that is better: a
-    body that meets an obstacle has false minima, and an effect that helps out of one is no cause."""
-    base = state.fit
-    if best.cost > FALSE_MINIMUM_RATIO * base.cost:
-        return base
-    values = {n: best.values.get(n, value) for n, value in base.values.items()}
-    try:
-        again = gauss_newton_fit(
-            state.forward_model, base.model, values, budget=2 * (len(values) + 2), robust_scale=state.robust_scale,
-            held=held_parameters(state.forward_model, base),
-        )  # fmt: skip
-    except MasivError:
-        return base
-    return min(base, again, key=lambda f: f.cost)
-
-
-# -- judgement -------------------------------------------------------------------------------------------------------
 
 
 def reasons_against(forward_model: ForwardModel, trial: Trial) -> list[str]:
@@ -329,15 +78,8 @@ def parameters_at_bounds(fitted: ModelFit, term: EffectTerm) -> list[str]:
     ]
 
 
-def _converged(trial: Trial, bases: Sequence[ModelFit]) -> bool:
-    """Whether the fit explains what the ranking promised, but for half of it. The base is the best one of its law."""
-    same = [b for b in bases if b.model.family.kind == trial.law] or list(bases)
-    base = min(b.cost for b in same)
-    return base - trial.fitted.cost >= MIN_PROMISE_KEPT * trial.candidate.explained * base
-
-
 def _judged(
-    state: SearchState, bases: Sequence[ModelFit], trials: Sequence[Trial], attempts: _Attempts,
+    state: SearchState, bases: Sequence[ModelFit], trials: Sequence[Trial], attempts: Attempts,
     settings: SearchSettings,
 ) -> Round:  # fmt: skip
     """The round with the posterior over the models without (``bases``) and with one effect more (``trials``)."""

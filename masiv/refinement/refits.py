@@ -1,0 +1,126 @@
+"""Fits of a round again, from where the best one ended or from where they fell short."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from masiv.errors import MasivError
+from masiv.inference.model_fit import (
+    ModelFit,
+    gauss_newton_fit,
+    held_parameters,
+    linear_strengths,
+)
+from masiv.models.base import ForwardModel
+from masiv.refinement.rounds import Trial
+from masiv.refinement.search_state import SearchSettings, SearchState
+from masiv.refinement.tasks import map_tasks
+from masiv.refinement.trials import converged, could_improve
+from masiv.workers import TaskError
+
+FALSE_MINIMUM_RATIO = 0.5
+"""A model with one more effect that has less than this part of its base's cost may have got out of a false minimum."""
+LONGER_BUDGET = 3
+"""Derivatives that a fit may take that has not reached what the ranking promised."""
+
+
+def refit_simpler(state: SearchState, trials: Sequence[Trial], settings: SearchSettings) -> list[Trial]:
+    """Trials, best first, of which those that are simpler than the best one, with the same law, are fitted again from
+    where that ended: a flexible effect that found the right law and initial state must not win for that alone. So too
+    an effect that is not smooth and no richer: its derivatives at a law that made up for it point to next to
+    nothing."""
+    model, best = state.forward_model, trials[0].fitted
+
+    def worth(trial: Trial) -> bool:
+        own, its = len(trial.fitted.parameters), len(best.parameters)
+        nonsmooth = model.term(trial.effect).nonsmooth
+        return trial.law == best.model.family.kind and (own < its or (own == its and nonsmooth))
+
+    simpler = [t for t in trials[1:] if worth(t)]
+    tasks = [(t.fitted, t.effect, best, state.robust_scale) for t in simpler]
+    again: dict[int, ModelFit] = {}
+    for done, (trial, fit) in enumerate(
+        zip(simpler, map_tasks(settings.workers, model, _refit_from, tasks), strict=True)
+    ):
+        settings.progress("refine: fit simpler effects again", done + 1, len(simpler), trial.effect)
+        if not isinstance(fit, TaskError):
+            again[id(trial)] = min(fit, trial.fitted, key=lambda f: f.cost)
+    return [replace(t, fitted=again.get(id(t), t.fitted)) for t in trials]
+
+
+def _refit_from(
+    forward_model: ForwardModel, fitted: ModelFit, name: str, best: ModelFit, robust_scale: float
+) -> ModelFit:
+    """``fitted``, a model with the term ``name``, from where what it shares with ``best`` ended. Raises
+    NonFiniteError."""
+    term = forward_model.term(name)
+    shared = {p.name for p in fitted.parameters} & {p.name for p in best.parameters}
+    values = {**fitted.values, **{n: best.values[n] for n in shared}}
+    values = linear_strengths(forward_model, fitted.model, values, term.strengths, robust_scale)
+    # An effect that is not smooth starts far from where it ends: four derivatives for two.
+    budget = (4 if term.nonsmooth else 2) * (len(fitted.parameters) + 2)
+    return gauss_newton_fit(
+        forward_model, fitted.model, values, budget=budget, robust_scale=robust_scale,
+        held=held_parameters(forward_model, fitted),
+    )  # fmt: skip
+
+
+def refit_unconverged(
+    state: SearchState, trials: Sequence[Trial], bases: Sequence[ModelFit], settings: SearchSettings
+) -> list[Trial]:
+    """Trials, best first, of which those that have not reached what the ranking promised go on with fresh derivatives:
+    from where they ended, and from where the best with the same law did. Those that would not be as good as the best
+    trial if they kept their promise do not."""
+    own = {b.model.family.kind: b for b in reversed(bases)}
+    failed = [t for t in trials if not converged(t, bases) and could_improve(t.candidate, own[t.law], trials)]
+    best = {law: next(t.fitted for t in trials if t.law == law) for law in {t.law for t in trials}}
+    tasks = [(t.fitted, best[t.law], state.robust_scale) for t in failed]
+    again: dict[int, ModelFit] = {}
+    results = map_tasks(settings.workers, state.forward_model, _refit_longer, tasks)
+    for done, (trial, fit) in enumerate(zip(failed, results, strict=True)):
+        settings.progress("refine: fit again what fell short", done + 1, len(failed), trial.effect)
+        if not isinstance(fit, TaskError):
+            again[id(trial)] = min(fit, trial.fitted, key=lambda f: f.cost)
+    return [replace(t, fitted=again.get(id(t), t.fitted)) for t in trials]
+
+
+def _refit_longer(forward_model: ForwardModel, fitted: ModelFit, best: ModelFit, robust_scale: float) -> ModelFit:
+    """The better of ``fitted`` fitted on, and from what it shares with ``best``. Raises MasivError if neither start can
+    be simulated."""
+    own = {p.name for p in fitted.parameters}
+    shared = {p.name: best.values[p.name] for p in best.parameters if p.name in own}
+    starts = [fitted.values] if best is fitted else [fitted.values, {**fitted.values, **shared}]
+    fits: list[ModelFit] = []
+    failed: MasivError | None = None
+    for values in starts:
+        try:
+            fits.append(
+                gauss_newton_fit(
+                    forward_model, fitted.model, values, budget=LONGER_BUDGET * (len(fitted.parameters) + 2),
+                    robust_scale=robust_scale, held=held_parameters(forward_model, fitted),
+                )
+            )  # fmt: skip
+        except MasivError as error:
+            failed = error
+    if not fits:
+        assert failed is not None
+        raise failed
+    return min(fits, key=lambda f: f.cost)
+
+
+def restart_base(state: SearchState, best: ModelFit) -> ModelFit:
+    """``state.fit``, or that fit from what it shares with ``best``, a model with one more effect, if that is better: a
+    body that meets an obstacle has false minima, and an effect that helps out of one is no cause."""
+    base = state.fit
+    if best.cost > FALSE_MINIMUM_RATIO * base.cost:
+        return base
+    values = {n: best.values.get(n, value) for n, value in base.values.items()}
+    try:
+        again = gauss_newton_fit(
+            state.forward_model, base.model, values, budget=2 * (len(values) + 2), robust_scale=state.robust_scale,
+            held=held_parameters(state.forward_model, base),
+        )  # fmt: skip
+    except MasivError:
+        return base
+    return min(base, again, key=lambda f: f.cost)
