@@ -19,6 +19,7 @@ import yaml
 from cloud_scene import surface, write_cloud
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from motion_capture_files import fall, write_motive, write_qtm, write_trc
 from small_run import KEY, write_run, write_scene
 from tiny_scenes import blender, nerfstudio, springgaus_real, springgaus_synthetic
 
@@ -251,6 +252,18 @@ def _c3d(folder: Path) -> Path:
     return folder
 
 
+def _motion_capture(folder: Path) -> Path:
+    """The same fall in three formats."""
+    folder.mkdir()
+    times = np.arange(20) / 100
+    write_trc(folder / "drop.trc", ["tip"], fall(times)[:, None], times)
+    write_qtm(folder / "drop.tsv", ["tip"], fall(times)[:, None], times)
+    write_motive(folder / "drop.csv", ["tip"], fall(times)[:, None], times)
+    runs = ", ".join(f"{{file: {name}, name: {name}}}" for name in ("drop.trc", "drop.tsv", "drop.csv"))
+    (folder / "scene.yaml").write_text(f"layout: tracks\nbodies: {{ball: {{mass: 1}}}}\nruns: [{runs}]\n")
+    return folder
+
+
 def _phystwin(folder: Path) -> Path:
     import cv2
 
@@ -276,6 +289,7 @@ SCENES: dict[str, Callable[[Path], Path]] = {
     "point clouds": _clouds,
     "tracks": _tracks,
     "C3D": _c3d,
+    "motion capture": _motion_capture,
 }
 FILES = [
     *(("PAC-NeRF", name) for name in ("all_data.json", "scene.yaml", "data/r_0_0.png")),
@@ -289,6 +303,7 @@ FILES = [
     *(("point clouds", name) for name in ("scene.yaml", "cloud_0.ply")),
     *(("tracks", name) for name in ("scene.yaml", "drops.csv")),
     ("C3D", "drop.c3d"),
+    *(("motion capture", f"drop.{ending}") for ending in ("trc", "tsv", "csv")),
 ]
 
 

@@ -128,8 +128,8 @@ class ColumnsDeclaration(_Part):
 class RunDeclaration(_Part):
     """One recording.
 
-    ``file``: CSV or C3D, relative to the scene. ``select``: only the rows whose columns have these values. ``markers``:
-    only these. ``time`` [s]: first and last time that is used.
+    ``file``: CSV, C3D, TRC or TSV, relative to the scene. ``select``: only the rows whose columns have these values.
+    ``markers``: only these; or a new name -> name in the file. ``time`` [s]: first and last time that is used.
     ``use``: `fit` for training; `hold_out` for validation, which takes part in the choice of effects; `test` for runs
     that nothing sees before their errors are reported. ``condition``: runs with the same name have the same
     treatment of the body, for example a load or a wind.
@@ -145,7 +145,7 @@ class RunDeclaration(_Part):
     use: Literal["fit", "hold_out", "test"] = "fit"
     condition: str = ""
     select: dict[str, str | int | float] = {}
-    markers: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    markers: Annotated[tuple[str, ...] | dict[str, str], Field(min_length=1)] | None = None
     rest_frames: tuple[Frame, Frame] | None = None
     release_time: FiniteFloat | None = None
     ignore_after_release: Annotated[FiniteFloat, Field(ge=0)] = 0.0
@@ -159,6 +159,14 @@ class RunDeclaration(_Part):
                 raise ValueError("unsteady is the earlier name of ignore_after_release: give one of them")
             return {"ignore_after_release" if key == "unsteady" else key: value for key, value in values.items()}
         return values
+
+    @field_validator("markers")
+    @classmethod
+    def _each_once(cls, value: tuple[str, ...] | dict[str, str] | None) -> tuple[str, ...] | dict[str, str] | None:
+        own = list(value.values() if isinstance(value, dict) else value or ())
+        if len(set(own)) < len(own):
+            raise ValueError("a marker is named twice: name each once")
+        return value
 
     @model_validator(mode="after")
     def _ordered(self) -> RunDeclaration:

@@ -1,4 +1,4 @@
-"""The layout of tracks: a ``scene.yaml`` with ``layout: tracks``, and CSV or C3D files of marker positions.
+"""The layout of tracks: a ``scene.yaml`` with ``layout: tracks``, and CSV, C3D, TRC or TSV files of marker positions.
 
 Positions are in m, cm or mm, converted to metres; times in seconds; gaps are NaN. Light: no torch, no taichi.
 """
@@ -18,8 +18,9 @@ from masiv.strict import read_yaml, validated
 from masiv.tracks.declaration import METRES, BodyDeclaration, RunDeclaration, TracksDeclaration
 from masiv.tracks.geometry import Geometry, make_geometry
 from masiv.tracks.placement import Placement, best_rigid
+from masiv.tracks.point_table import Table
 from masiv.tracks.release import estimate_release
-from masiv.tracks.table import Table, read_table
+from masiv.tracks.table import read_table
 from masiv.tracks.tracks import Clamp, Run, TrackedBody, Tracks, rest_positions
 
 
@@ -161,12 +162,13 @@ def _run(
 def _select_markers(where: str, run: RunDeclaration, table: Table) -> tuple[tuple[str, ...], np.ndarray]:
     if run.markers is None:
         return table.markers, table.positions
-    for marker in run.markers:
+    named = run.markers if isinstance(run.markers, dict) else {marker: marker for marker in run.markers}
+    for marker in named.values():
         if marker not in table.markers:
             raise InputError(
                 f"scene.yaml: {where}: no marker '{marker}' in {run.file}: it has {', '.join(table.markers)}"
             )
-    return run.markers, table.positions[:, [table.markers.index(marker) for marker in run.markers]]
+    return tuple(named), table.positions[:, [table.markers.index(marker) for marker in named.values()]]
 
 
 def _unit(where: str, table: Table, declared: TracksDeclaration, problems: list[str]) -> float:

@@ -1,4 +1,4 @@
-"""Files of measured points: CSV and C3D. Light: no torch, no taichi."""
+"""Files of measured points: which reader a file gets, CSV and C3D. Light: no torch, no taichi."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import io
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,40 +16,28 @@ import numpy as np
 from masiv.errors import InputError
 from masiv.strict import quoted, shortened
 from masiv.tracks.declaration import ColumnsDeclaration
+from masiv.tracks.motion_capture import is_motive_csv, read_motive_csv, read_qtm_tsv, read_trc
+from masiv.tracks.point_table import Table
 
 _POSITION = re.compile(r"^(?P<marker>.+?)[ _.:](?P<axis>[xyzXYZ])(?:[ _]?[\[(]?(?P<unit>mm|cm|m)[\])]?)?$")
 _UNIT = re.compile(r"[ _]?[\[(]?(?P<unit>mm|cm|m)[\])]?$")
 _TIME = re.compile(r"^(time|t)(?:[ _]?[\[(]?(?P<unit>s|ms)[\])]?)?$", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class Table:
-    """The content of a file.
-
-    positions (T, M, 3) in ``unit`` (None: the file does not give it), NaN for a gap; times (T,) [s] or None; rate [Hz]
-    or None; ignored: columns that are not positions.
-    """
-
-    markers: tuple[str, ...]
-    positions: np.ndarray
-    times: np.ndarray | None
-    rate: float | None
-    unit: str | None
-    ignored: tuple[str, ...] = ()
-
-
 def read_table(path: Path, columns: ColumnsDeclaration | None, select: Mapping[str, str | int | float]) -> Table:
-    """The points of a CSV or C3D file. Raises InputError if it cannot be read."""
+    """The points of a file, by its ending: CSV (also as Motive writes it), C3D, TRC, TSV of QTM. Raises InputError if
+    it cannot be read."""
     ending = path.suffix.lower()
     if not path.is_file():
         raise InputError(f"{path} does not exist or is not a regular file: correct runs.file in scene.yaml")
-    if ending == ".csv":
+    if ending == ".csv" and not is_motive_csv(path):
         return read_csv(path, columns, select)
-    if ending == ".c3d":
-        if select or columns is not None:
-            raise InputError(f"{path}: a C3D file has no columns: leave out columns and select")
-        return read_c3d(path)
-    raise InputError(f"{path}: tracks are read from .csv and .c3d files: convert it to CSV")
+    readers = {".csv": read_motive_csv, ".c3d": read_c3d, ".trc": read_trc, ".tsv": read_qtm_tsv}
+    if ending not in readers:
+        raise InputError(f"{path}: tracks are read from .csv, .c3d, .trc and .tsv files: convert it to CSV")
+    if select or columns is not None:
+        raise InputError(f"{path}: a file of motion capture says what its columns are: leave out columns and select")
+    return readers[ending](path)
 
 
 def read_csv(path: Path, columns: ColumnsDeclaration | None, select: Mapping[str, str | int | float]) -> Table:
