@@ -48,13 +48,14 @@ VIDEO_SETTINGS = {
     },
     "trajectory": {"particle_count": 300, "fill_resolution": 24, "iterations": 20},
     "identify": {"start": "jelly", "contact": "sticky", "search_particles": 150, "iterations": 4, "processes": 2},
+    "refine": {"particles": 150, "families": 1, "effects": ["linear_drag"], "max_effects": 1, "processes": 2},
 }
 """Coarse: what is tested is that numbers are the same, not that they are good."""
 CUBE = {
     "shape": {"kind": "cube", "size": 0.4, "rotation_deg": [20, 30, 0], "clearance": 0.25},
     "material": {"law": "neo_hookean", "parameters": {"youngs_modulus": 4e4, "poissons_ratio": 0.3}},
     "velocity": [0.5, -1.5, 0.0],
-    "frames": 6,
+    "frames": 8,
     "cameras": {"count": 6, "size": 48, "field_of_view_deg": 28},
     "truth_particles": 500,
 }
@@ -65,6 +66,7 @@ TAG = "MASIV_KILLS"
 def commands(scene: str, folder: Path) -> list[list[str]]:
     """Those of a whole run of ``scene`` in ``folder``/run, in order. Their settings and data are written beside it."""
     run = str(folder / "run")
+    refine = ["refine", run]
     settings = folder / "settings.yaml"
     folder.mkdir(parents=True, exist_ok=True)
     settings.write_text(json.dumps({"bar": BAR_SETTINGS, "balls": BALLS_SETTINGS, "cube": VIDEO_SETTINGS}[scene]))
@@ -73,9 +75,8 @@ def commands(scene: str, folder: Path) -> list[list[str]]:
         if not (folder / "scene").exists():
             complete(["synth", str(folder / "spec.yaml"), "--out", str(folder / "scene")])
         stages = ["reconstruct", str(folder / "scene"), "--out", run, "--config", str(settings), "--fit-frames", "5"]
-        return [stages, ["trajectory", run], ["identify", *stages[1:]]]
+        return [stages, ["trajectory", run], ["identify", *stages[1:]], refine]
     identify = ["identify", str(SCENES / scene), "--out", run, "--config", str(settings)]
-    refine = ["refine", run]
     return [identify, *([refine, [*refine, "--condition", "load"]] if scene == "bar" else [[*refine, "--group"]])]
 
 
@@ -205,6 +206,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="keep the runs here")
     parser.add_argument("--scenes", nargs="+", choices=["bar", "balls", "cube"], default=["bar", "balls", "cube"])
     options = parser.parse_args()
+    # A shell may start what it runs in the background with SIGINT ignored, and commands would inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     draw, tally = random.Random(options.seed), Tally()
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.out or Path(temporary)
