@@ -15,6 +15,7 @@ from .options import (
     PresetOption,
     RunArgument,
     SeedOption,
+    SetOption,
     overrides,
 )
 
@@ -27,6 +28,7 @@ def evaluate(
     ] = None,
     scene: MovedSceneOption = None,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -42,7 +44,7 @@ def evaluate(
 
     from .console import progress_bar
 
-    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
+    opened = reopen_run(run, overrides(preset, config, seed, arch, assignments), scene=scene)
     with progress_bar() as progress:
         result = opened.evaluate(truth, progress)
     return result.data, result.text

@@ -17,6 +17,7 @@ from .options import (
     PresetOption,
     SceneArgument,
     SeedOption,
+    SetOption,
     overrides,
 )
 
@@ -57,6 +58,7 @@ def identify(
     holdout: HoldoutOption = None,
     keep_calibration: KeepCalibrationOption = False,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -83,7 +85,7 @@ def identify(
         "pictures": 0 if no_silhouette else None,
     }
     request = SceneRequest(fit_frames, tuple(holdout or ()), asked, no_silhouette, keep_calibration)
-    run = open_run(scene, out, overrides(preset, config, seed, arch), request)
+    run = open_run(scene, out, overrides(preset, config, seed, arch, assignments), request)
     with progress_bar() as progress:
         result = run.identify(progress)
     return result.data, result.text

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SceneArgument, SeedOption, overrides
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SceneArgument, SeedOption, SetOption, overrides
 
 
 def inspect(
@@ -16,6 +16,7 @@ def inspect(
         Path | None, typer.Option("--out", help="Where to write the picture. [default: SCENE_inspect.png]")
     ] = None,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -27,5 +28,5 @@ def inspect(
     """
     from masiv.pipeline import inspect_scene
 
-    result = inspect_scene(scene, out, overrides(preset, config, seed, arch))
+    result = inspect_scene(scene, out, overrides(preset, config, seed, arch, assignments))
     return result.data, result.text

@@ -10,6 +10,7 @@ import typer
 import masiv
 
 from . import console
+from .config import config
 from .evaluate import evaluate
 from .identify import identify
 from .inspect import inspect
@@ -28,7 +29,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-for function in (identify, inspect, reconstruct, trajectory, refine, simulate, evaluate, pretrain, synth):
+for function in (identify, inspect, reconstruct, trajectory, refine, simulate, evaluate, pretrain, synth, config):
     app.command()(console.command(function))
 
 

@@ -18,7 +18,16 @@ MovedSceneOption = Annotated[
     Path | None, typer.Option("--scene", help="Where the run's scene is now. [default: where it was, seen from RUN]")
 ]
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="YAML with settings; over the preset, under flags.")
+    Path | None, typer.Option("--config", help="YAML with settings; over the preset, under --set and flags.")
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="One setting, as in reconstruct.iterations=200 (`masiv config` lists them); over --config, under flags; "
+        "may be repeated.",
+    ),
 ]
 PresetOption = Annotated[str | None, typer.Option("--preset", help="quick, standard or paper. [default: standard]")]
 ArchOption = Annotated[str | None, typer.Option("--arch", help="cpu, cuda or vulkan. [default: cpu]")]
@@ -35,11 +44,13 @@ KeepCalibrationOption = Annotated[
 ]
 
 
-def overrides(preset: str | None, config: Path | None, seed: int | None, arch: str | None) -> Overrides:
+def overrides(
+    preset: str | None, config: Path | None, seed: int | None, arch: str | None, assignments: list[str] | None
+) -> Overrides:
     """The settings that a command was given."""
     from masiv.pipeline import Overrides
 
-    return Overrides(preset, config, seed, arch)
+    return Overrides(preset, config, seed, arch, tuple(assignments or ()))
 
 
 def vector(text: str | None, flag: str) -> np.ndarray | None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption, SetOption
 
 
 def pretrain(
@@ -18,6 +18,7 @@ def pretrain(
         Path | None, typer.Option("--out", help="Where to write the law. [default: MATERIAL.safetensors]")
     ] = None,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -32,7 +33,7 @@ def pretrain(
 
     from .console import progress_bar
 
-    settings = load_config(preset, config, seed=seed, arch=arch)
+    settings = load_config(preset, config, assignments=assignments or (), seed=seed, arch=arch)
     target = out or Path(f"{material}.safetensors")
     runtime.start(settings.arch)
     from masiv.pretraining.pretrain import pretrain as teach

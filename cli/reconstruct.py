@@ -17,6 +17,7 @@ from .options import (
     PresetOption,
     SceneArgument,
     SeedOption,
+    SetOption,
     overrides,
 )
 
@@ -28,6 +29,7 @@ def reconstruct(
     holdout: HoldoutOption = None,
     keep_calibration: KeepCalibrationOption = False,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -42,7 +44,7 @@ def reconstruct(
     from .console import progress_bar
 
     request = SceneRequest(fit_frames, tuple(holdout or ()), keep_calibration=keep_calibration)
-    run = open_run(scene, out, overrides(preset, config, seed, arch), request)
+    run = open_run(scene, out, overrides(preset, config, seed, arch, assignments), request)
     with progress_bar() as progress:
         result = run.reconstruct(progress)
     return result.data, result.text

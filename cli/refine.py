@@ -15,6 +15,7 @@ from .options import (
     PresetOption,
     RunArgument,
     SeedOption,
+    SetOption,
     overrides,
 )
 
@@ -40,6 +41,7 @@ def refine(
     ] = False,
     scene: MovedSceneOption = None,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -58,7 +60,7 @@ def refine(
     from .console import progress_bar
 
     request = RefineRequest(second, group, condition, dry_run, relearn)
-    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
+    opened = reopen_run(run, overrides(preset, config, seed, arch, assignments), scene=scene)
     with progress_bar() as progress:
         result = opened.refine(request, progress)
     return result.data, result.text

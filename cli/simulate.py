@@ -15,6 +15,7 @@ from .options import (
     PresetOption,
     RunArgument,
     SeedOption,
+    SetOption,
     overrides,
     vector,
 )
@@ -64,6 +65,7 @@ def simulate(
     ] = None,
     scene: MovedSceneOption = None,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -99,7 +101,7 @@ def simulate(
         render=render,
         view=tuple(view or ()),
     )
-    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
+    opened = reopen_run(run, overrides(preset, config, seed, arch, assignments), scene=scene)
     with progress_bar() as progress:
         result = opened.simulate(request, out or Path(f"{run.resolve().name}_simulate"), progress)
     return result.data, result.text

@@ -7,13 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption, SetOption
 
 
 def synth(
     spec: Annotated[Path, typer.Argument(metavar="SPEC.yaml", help="What to simulate and film.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="Folder of the new scene.", show_default=False)],
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -29,9 +30,9 @@ def synth(
 
     from .console import progress_bar
 
-    settings = load_config(preset, config, seed=seed, arch=arch)
+    settings = load_config(preset, config, assignments=assignments or (), seed=seed, arch=arch)
     request = read_spec(spec)
-    if seed is not None:
+    if "seed" in settings.model_fields_set:
         request = request.model_copy(update={"seed": settings.seed})
     runtime.start(settings.arch)
     from masiv.synth.synthesise import synthesise

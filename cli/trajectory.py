@@ -12,6 +12,7 @@ from .options import (
     PresetOption,
     RunArgument,
     SeedOption,
+    SetOption,
     overrides,
 )
 
@@ -20,6 +21,7 @@ def trajectory(
     run: RunArgument,
     scene: MovedSceneOption = None,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -33,7 +35,7 @@ def trajectory(
 
     from .console import progress_bar
 
-    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
+    opened = reopen_run(run, overrides(preset, config, seed, arch, assignments), scene=scene)
     with progress_bar() as progress:
         result = opened.trajectory(progress)
     return result.data, result.text

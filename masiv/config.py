@@ -1,11 +1,12 @@
-"""The whole configuration. Order: defaults < preset < --config < flags. Light: no torch, no taichi."""
+"""The whole configuration. Order: defaults < preset < --config < --set < flags. Light: no torch, no taichi."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -18,7 +19,7 @@ from masiv.refinement.config import REMOVED_KEYS as REFINE_REMOVED_KEYS
 from masiv.refinement.config import RENAMED_KEYS as REFINE_RENAMED_KEYS
 from masiv.refinement.config import RefineConfig
 from masiv.splat.config import ReconstructConfig
-from masiv.strict import quoted, read_yaml, validated
+from masiv.strict import parsed_yaml, quoted, read_yaml, shortened, validated
 from masiv.tracks.config import TracksConfig
 
 RENAMED_KEYS = {
@@ -44,6 +45,9 @@ REMOVED_KEYS = tuple(f"refine.{name}" for name in REFINE_REMOVED_KEYS)
 RENAMED_VALUES = {"identify.start": RENAMED_STARTS}
 """Values of earlier versions by section and key: old value -> new value."""
 
+LONGEST_KEY = 100
+"""Characters of a key that are compared with known ones."""
+
 Preset = Literal["quick", "standard", "paper"]
 DEFAULT_PRESET = "standard"
 
@@ -53,9 +57,9 @@ class Config(BaseModel):
     key may change the numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    preset: Preset = DEFAULT_PRESET
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    arch: Literal["cpu", "cuda", "vulkan"] = "cpu"
+    preset: Preset = Field(DEFAULT_PRESET, description="the settings that all others start from")
+    seed: int = Field(0, ge=0, lt=2**31, description="seed of every random number")
+    arch: Literal["cpu", "cuda", "vulkan"] = Field("cpu", description="where Taichi runs its kernels")
     reconstruct: ReconstructConfig = ReconstructConfig.model_validate({})
     trajectory: TrajectoryConfig = TrajectoryConfig.model_validate({})
     simulator: SimulatorConfig = SimulatorConfig.model_validate({})
@@ -68,23 +72,26 @@ def load_config(
     preset: str | None = None,
     path: Path | None = None,
     base: Mapping[str, Any] | None = None,
+    assignments: Sequence[str] = (),
     **flags: int | float | str | list[str] | None,
 ) -> Config:
-    """The configuration from a preset, a YAML file and flags (None: not given); flag "identify.law" is a nested key.
+    """The configuration from a preset, a YAML file, assignments and flags (None: not given); flag "identify.law" is a
+    nested key.
 
+    An assignment is text, "reconstruct.iterations=200", with the value in YAML; the last one of a key counts.
     ``base`` is the configuration of an existing run. It takes the place of the defaults; under a preset that
     is given, only its seed and arch do.
     Raises InputError for an unknown preset or key, naming the nearest known one, and for a value out of range.
     """
-    from_file = {} if path is None else renamed_keys(read_yaml(path))
-    name = preset or from_file.get("preset")
+    given = given_settings(path, assignments)
+    name = preset or given.get("preset")
     merged: dict[str, Any] = without_removed_keys(renamed_keys(base or {}))
     if name is not None or base is None:
         kept = {key: merged[key] for key in ("seed", "arch") if key in merged}
         merged = {**kept, **preset_overlay(str(name or DEFAULT_PRESET))}
     else:  # a key of an earlier version is the run's, not of what is given now
         validated(Config, merged, "run.yaml of the run, section config")
-    merged = _merged(merged, from_file)
+    merged = _merged(merged, given)
     if preset is not None:
         merged["preset"] = preset
     for key, value in flags.items():
@@ -92,6 +99,50 @@ def load_config(
             _check_flag(key, value)
             merged = _merged(merged, _nested(key, value))
     return validated(Config, merged, "the command line" if path is None else str(path))
+
+
+def given_settings(path: Path | None = None, assignments: Sequence[str] = ()) -> dict[str, Any]:
+    """The keys that a YAML file and assignments set, the latter over the former. Raises InputError for a file that is
+    no YAML and for an assignment that the configuration would not take; it names --set and the nearest known key."""
+    given = {} if path is None else renamed_keys(read_yaml(path))
+    for text in assignments:
+        given = _merged(given, _assigned(text))
+    return given
+
+
+def _assigned(text: str) -> dict[str, Any]:
+    """``key=value`` as a nested mapping that is valid."""
+    key, equals, value = (part.strip() for part in text.partition("="))
+    if not (key and equals and value):
+        raise InputError(
+            f"--set {quoted(text)}: give a key and its value, for example --set reconstruct.iterations=200"
+        )
+    where = f"--set {shortened(text)}"
+    if key not in (*_keys_and_sections(), *RENAMED_KEYS):
+        raise InputError(f"{where}: unknown key '{shortened(key)}': did you mean '{nearest_key(key)}'?")
+    setting = renamed_keys(_nested(key, parsed_yaml(value, where)))
+    validated(Config, setting, where)
+    return setting
+
+
+def dotted_keys(model: type[BaseModel] = Config, above: str = "") -> Iterator[str]:
+    """Every key of the configuration as --set takes it: "seed", "reconstruct.calibration.rotation_deg" …"""
+    for name, field in model.model_fields.items():
+        nested = field.annotation
+        if isinstance(nested, type) and issubclass(nested, BaseModel):
+            yield from dotted_keys(nested, f"{above}{name}.")
+        else:
+            yield above + name
+
+
+def nearest_key(key: str) -> str:
+    """The key or section of the configuration whose dotted name is most like ``key``."""
+    return difflib.get_close_matches(key[:LONGEST_KEY], _keys_and_sections(), n=1, cutoff=0.0)[0]
+
+
+def _keys_and_sections() -> list[str]:
+    keys = list(dotted_keys())
+    return [*keys, *sorted({key[:end] for key in keys for end, letter in enumerate(key) if letter == "."})]
 
 
 def _check_flag(key: str, value: object) -> None:

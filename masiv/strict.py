@@ -36,16 +36,21 @@ class _Loader(yaml.SafeLoader):
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; {} for an empty file. Raises InputError where it cannot be one."""
-    try:
-        data = yaml.load(_text(path), _Loader)  # a SafeLoader
-    except (yaml.YAMLError, *UNREADABLE) as error:
-        detail = shortened(error).replace(' in "<unicode string>"', "")
-        raise InputError(f"{path} is not valid YAML: {detail}") from error
+    data = parsed_yaml(_text(path), str(path))
     if data is None:
         return {}
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold `key: value` lines, found a {type(data).__name__}")
     return data
+
+
+def parsed_yaml(text: str, where: str) -> Any:
+    """What ``text`` says in YAML. Raises InputError that names ``where`` if it is not YAML."""
+    try:
+        return yaml.load(text, _Loader)  # a SafeLoader
+    except (yaml.YAMLError, *UNREADABLE) as error:
+        detail = shortened(error).replace(' in "<unicode string>"', "")
+        raise InputError(f"{where} is not valid YAML: {detail}") from error
 
 
 def read_json(path: Path) -> Any:

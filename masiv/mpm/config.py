@@ -13,12 +13,18 @@ class SimulatorConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    particles_per_cell: float = Field(6.0, gt=0.5, le=64, description="sets the grid spacing from the particle spacing")
+    particles_per_cell: float = Field(
+        6.0, gt=0.5, le=64, description="particles in a cell of the grid: sets its spacing"
+    )
     subparticles: Literal[1, 4, 8] = Field(
         4, description="particles into which each one is subdivided for a prediction, on the same grid; not for a fit"
     )
-    courant_number: float = Field(0.3, gt=0, le=0.8, description="cells that sound and matter may cross in a substep")
-    max_substeps_per_frame: int = Field(400, ge=1, description="a stiffer law than this allows is an error")
+    courant_number: float = Field(
+        0.3, gt=0, le=0.8, description="distance that sound and matter may cross in a substep [cells]"
+    )
+    max_substeps_per_frame: int = Field(
+        400, ge=1, description="substeps of a frame, at most; a stiffer law is an error"
+    )
     grid_nodes: int = Field(1 << 18, ge=1 << 10, description="nodes reserved for the window around the object")
-    memory_mb: int = Field(1500, ge=1, description="bound on the states kept for the adjoint")
+    memory_mb: int = Field(1500, ge=1, description="memory for the states that the adjoint needs, at most [MB]")
     chunks: int = Field(2, ge=1, le=64, description="particle chunks that scatter apart on a CPU; part of the numbers")

@@ -23,12 +23,14 @@ class Summary:
 
 @dataclass(frozen=True)
 class Overrides:
-    """Settings over those of an existing run, or over the defaults: a preset, a YAML file, a seed, a Taichi backend."""
+    """Settings over those of an existing run, or over the defaults: a preset, a YAML file, a seed, a Taichi backend,
+    assignments ("reconstruct.iterations=200")."""
 
     preset: str | None = None
     config: Path | None = None
     seed: int | None = None
     arch: str | None = None
+    assignments: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -127,8 +127,7 @@ def inspect_scene(scene: Path, picture: Path | None = None, overrides: Overrides
     from masiv.observations.read import read_observation
     from masiv.report.inspection import inspection
 
-    o = overrides or Overrides()
-    load_config(o.preset, o.config, seed=o.seed, arch=o.arch)
+    settings(overrides or Overrides(), None)
     target = picture or Path(f"{scene.resolve().stem if scene.is_file() else scene.resolve().name}_inspect.png")
     summary, text = inspection(read_observation(scene), target)
     return Summary(summary, text)
@@ -136,4 +135,5 @@ def inspect_scene(scene: Path, picture: Path | None = None, overrides: Overrides
 
 def settings(overrides: Overrides, base: dict[str, Any] | None, **flags: Any) -> Config:
     """The configuration of a run: ``base`` of an existing one, under ``overrides``, under ``flags``."""
-    return load_config(overrides.preset, overrides.config, base, seed=overrides.seed, arch=overrides.arch, **flags)
+    o = overrides
+    return load_config(o.preset, o.config, base, o.assignments, seed=o.seed, arch=o.arch, **flags)

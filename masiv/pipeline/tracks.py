@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from masiv.config import Config
+from masiv.config import Config, given_settings
 from masiv.errors import InputError
 from masiv.files import write_json, write_npz
 from masiv.observations.identity import identity
@@ -15,7 +15,7 @@ from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, Simu
 from masiv.pipeline.run import Run, settings
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder, refuse_run
-from masiv.strict import read_json, read_yaml
+from masiv.strict import read_json
 from masiv.tracks.read import read_tracks
 from masiv.tracks.tracks import Tracks
 
@@ -62,8 +62,8 @@ class TracksRun(Run):
         """As ``Run.open``. The law is ``auto`` if none is named, since markers cannot teach a neural one."""
         refuse(request, NOT_REQUESTED_OF_TRACKS, "pictures", scene)
         existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
-        file = overrides.config
-        named = file is not None and "law" in (read_yaml(file).get("identify") or {})
+        given = given_settings(overrides.config, overrides.assignments).get("identify")
+        named = isinstance(given, dict) and "law" in given
         law = request.identify.get("law")
         if law is None and existing is None and not named:
             law = "auto"
