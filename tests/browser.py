@@ -1,4 +1,4 @@
-"""A headless Chromium for tests of pages: the one that the system has (Debian's package chromium), driven by playwright.
+"""A headless Chromium for tests of pages: the one that the system has (Debian's package chromium), with playwright.
 
 The fixture ``browser`` of conftest.py is the one of ``launched``; it skips where no browser is installed.
 """
@@ -22,7 +22,16 @@ ARGUMENTS = (
     "--disable-component-update", "--disable-sync",
     "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",  # WebGL on the CPU
 )  # fmt: skip
-LOCAL = ("file:", "data:", "blob:", "about:", "http://localhost", "http://127.0.0.1", "ws://localhost", "ws://127.0.0.1")
+LOCAL = (
+    "file:",
+    "data:",
+    "blob:",
+    "about:",
+    "http://localhost",
+    "http://127.0.0.1",
+    "ws://localhost",
+    "ws://127.0.0.1",
+)
 """What a page may load: the rest counts as a request to the network."""
 
 

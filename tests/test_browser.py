@@ -7,7 +7,9 @@ from browser import watched
 
 def test_errors_and_requests_are_seen(browser, tmp_path):
     path = tmp_path / "page.html"
-    path.write_text('<script>console.error("a"); setTimeout(() => b.c)</script><img src="http://example.invalid/x.png">')
+    path.write_text(
+        '<script>console.error("a"); setTimeout(() => b.c)</script><img src="http://example.invalid/x.png">'
+    )
     with watched(browser) as seen:
         seen.page.goto(path.as_uri())
         seen.page.wait_for_timeout(200)
