@@ -1,6 +1,6 @@
 """What was never filmed, as pictures: one row a variation of a twin, one column a moment.
 
-    python benchmarks/novel.py RUN OTHER_RUN OUT.jpg [--frames 20] [--view 0]
+    python benchmarks/novel.py RUN OTHER_RUN OUT.jpg [--frames 20] [--camera 0]
 
 RUN and OTHER_RUN: what ``masiv identify`` left of two objects; the second one gives its material and its body.
 """
@@ -35,11 +35,11 @@ def variations(other: Path) -> dict[str, list[str]]:
     }
 
 
-def row(run: Path, label: str, options: list[str], frames: int, view: int) -> np.ndarray:
+def row(run: Path, label: str, options: list[str], frames: int, camera: str) -> np.ndarray:
     """Pictures (H, W, 3) uint8 of one variation side by side, under its label."""
     with tempfile.TemporaryDirectory() as folder:
         masiv = [sys.executable, "-c", "from masiv.cli.main import run; run()"]
-        given = ["simulate", str(run), "--frames", str(frames), "--render", "--view", str(view), "--out", folder]
+        given = ["simulate", str(run), "--frames", str(frames), "--render", "--camera", camera, "--out", folder]
         subprocess.run([*masiv, *given, *options], check=True)
         paths = sorted(Path(folder, "views").rglob("*.png"))
         chosen = [cv2.imread(str(paths[round(m * (len(paths) - 1))])) for m in MOMENTS]
@@ -55,9 +55,9 @@ def main() -> None:
     parser.add_argument("other", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--view", type=int, default=0)
+    parser.add_argument("--camera", default="0")
     o = parser.parse_args()
-    rows = [row(o.run, label, options, o.frames, o.view) for label, options in variations(o.other).items()]
+    rows = [row(o.run, label, options, o.frames, o.camera) for label, options in variations(o.other).items()]
     cv2.imwrite(str(o.out), np.concatenate(rows), [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 

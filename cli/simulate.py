@@ -59,9 +59,23 @@ def simulate(
     condition: Annotated[
         str | None, typer.Option("--condition", help="Tracks: with what acts in the runs of this condition.")
     ] = None,
-    render: Annotated[bool, typer.Option("--render", help="Also draw views/*.png and video.mp4.")] = False,
-    view: Annotated[
-        list[int] | None, typer.Option("--view", help="Camera to draw; may be repeated. [default: 0]")
+    render: Annotated[
+        bool, typer.Option("--render", help="Also draw views/*.png and video.mp4; so do the next three options.")
+    ] = False,
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--camera",
+            metavar="CAMERA|free:X,Y,Z,LX,LY,LZ|orbit",
+            help="Index or name of a camera of the scene; a place and what it looks at [m]; or around the body "
+            "(orbit:turns=1,elevation=20,distance=3). May be repeated. [default: 0]",
+        ),
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="WxH", help="Size of the pictures [px]. [default: the camera's]")
+    ] = None,
+    slow: Annotated[
+        float | None, typer.Option("--slow", metavar="FACTOR", help="Slow the video down. [default: 1]")
     ] = None,
     scene: MovedSceneOption = None,
     config: ConfigOption = None,
@@ -76,6 +90,8 @@ def simulate(
     What is not given is as identified.
 
     Example: `masiv simulate runs/bunny --frames 32 --velocity=1,2,0 --gravity=0,-1.6,0 --out moon --render`
+
+    Once round it, four times slower: `masiv simulate runs/bunny --frames 32 --camera orbit --slow 4 --size 640x480`
 
     Another: `masiv simulate runs/bunny --frames 32 --law runs/cross --blend 0.5 --force=0,0,900 --force-until 0.1`
     """
@@ -99,7 +115,9 @@ def simulate(
         without=tuple(without or ()),
         condition=condition,
         render=render,
-        view=tuple(view or ()),
+        camera=tuple(camera or ()),
+        size=size,
+        slow=slow,
     )
     opened = reopen_run(run, overrides(preset, config, seed, arch, assignments), scene=scene)
     with progress_bar() as progress:

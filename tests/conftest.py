@@ -21,6 +21,15 @@ def taichi():
     return runtime.start("cpu")
 
 
+@pytest.fixture(scope="session")
+def browser():
+    """A headless Chromium (playwright's ``Browser``); the test is skipped where none is installed."""
+    from browser import launched
+
+    with launched() as found:
+        yield found
+
+
 # ---- the cube of tests/cube.py, simulated once a process ------------------------------------------------------------
 
 

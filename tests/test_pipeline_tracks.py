@@ -126,7 +126,7 @@ def test_a_condition_names_one_file_inside_the_run_folder(one, other):
             lambda run, out: masiv.open_run(BALLS, out, request=SceneRequest(keep_calibration=True)),
             "--keep-calibration",
         ),
-        (lambda run, out: run.simulate(SimulateRequest(3, view=(0,)), out), "--view"),
+        (lambda run, out: run.simulate(SimulateRequest(3, camera=("0",)), out), "--camera"),
         (lambda run, out: run.simulate(SimulateRequest(3, force_from=0.0), out), "--force-from"),
         (lambda run, out: run.refine(RefineRequest(second_run=out)), "--second-run"),
         (lambda run, out: run.evaluate(out), "--truth"),

@@ -56,7 +56,9 @@ class SimulateRequest:
     velocity (3,) [m/s], omega (3,) [rad/s], gravity (3,) [m/s^2], force (3,) [N] from ``force_from`` to ``force_until``
     [s]: world frame. law: another run, whose material is taken with weight ``blend``. geometry: a mesh, or another
     run. density [kg/m^3]. ground: "none" or a height [m]. without: effects that are left out. condition: of the runs
-    whose effects act. render: draw the cameras ``view``.
+    whose effects act. render: draw it. camera: from where (``masiv.report.viewpoints.parse_view``; empty: the first
+    camera of the scene, or an orbit if it has none). size: of the pictures, "WIDTHxHEIGHT". slow: how many times slower
+    than the motion the video runs. Any of these three draws, too.
     """
 
     frames: int
@@ -74,7 +76,14 @@ class SimulateRequest:
     without: tuple[str, ...] = ()
     condition: str | None = None
     render: bool = False
-    view: tuple[int, ...] = ()
+    camera: tuple[str, ...] = ()
+    size: str | None = None
+    slow: float | None = None
+
+    @property
+    def draws(self) -> bool:
+        """Whether pictures are asked for."""
+        return self.render or bool(self.camera) or self.size is not None or self.slow is not None
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 NOT_FOR_TRACKS = (
     *("omega", "law", "blend", "geometry", "density", "ground"),
-    *("force", "force_from", "force_until", "render", "view"),
+    *("force", "force_from", "force_until", "render", "camera", "size", "slow"),
 )
 """Fields of ``SimulateRequest`` that apply to a filmed body alone."""
 NOT_REQUESTED_OF_TRACKS = (

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from masiv.config import Config
 from masiv.errors import InputError
@@ -20,7 +19,15 @@ from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, Simu
 from masiv.pipeline.run import Run, reopen_run, settings
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder, refuse_run
+from masiv.scene.calibration import Calibration
+from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from masiv.report.viewpoints import View
+
+MIN_SLOW, MAX_SLOW = 0.01, 100.0
+"""How many times slower than the motion a video may run: one of a second lasts 10 ms to 100 s."""
 
 
 class VideoRun(Run):
@@ -167,14 +174,7 @@ class VideoRun(Run):
         refuse(request, ("condition",), "tracks", self.scene_path)
         self.folder.require("identify")
         refuse_run(out, "--out")
-        views = request.view or (0,)
-        if request.view and not request.render:
-            raise InputError(f"--view {request.view[0]} says what --render draws: add --render")
-        if request.render and not self.scene.cameras:
-            raise InputError(f"{self.scene.path} has point clouds and no cameras: leave out --render")
-        for index in views if request.render else ():
-            if not 0 <= index < len(self.scene.cameras):
-                raise InputError(f"--view {index}: the scene has cameras 0 to {len(self.scene.cameras) - 1}")
+        views, cameras, size = self._views(request)
         if request.force is None and (request.force_from is not None or request.force_until is not None):
             raise InputError("--force-from and --force-until need --force FX,FY,FZ")
         if request.blend is not None and request.law is None:
@@ -182,6 +182,7 @@ class VideoRun(Run):
         self.start()
         from masiv.pipeline.variation import vary_twin
         from masiv.report.film import film
+        from masiv.report.viewpoints import viewpoints
         from masiv.simulation.force import ForcePulse
         from masiv.simulation.simulate import simulate
         from masiv.simulation.twin_effects import body_mass
@@ -214,11 +215,36 @@ class VideoRun(Run):
             "law": twin.law.description(),
             "effects": [effect.name for effect in twin.effects],
         }
-        if request.render:
-            drawn = replace(self.scene, ground=self.scene.ground if request.ground is None else twin.ground)
-            film(drawn, gaussians(), rollout.positions, list(views), out, progress=progress)
+        if request.draws:
+            film(
+                viewpoints(views, cameras, rollout.positions, twin.up, size), gaussians(), rollout.positions, out,
+                up=twin.up, ground=twin.ground, fps=twin.fps / (request.slow or 1.0), progress=progress,
+            )  # fmt: skip
             data["video"] = str(out / "video.mp4")
         return Summary(data, "\n".join(str(data[name]) for name in ("rollout", "video") if name in data))
+
+    def _views(self, request: SimulateRequest) -> tuple[list[View], tuple[Camera, ...], tuple[int, int] | None]:
+        """What is drawn: from where, cameras of the scene, size of the pictures. Raises InputError."""
+        from masiv.report.viewpoints import OrbitView, SceneView, parse_size, parse_view, scene_camera
+
+        if not request.draws:
+            return [], (), None
+        if request.slow is not None and not MIN_SLOW <= request.slow <= MAX_SLOW:
+            raise InputError(f"--slow {request.slow:g}: give a factor from {MIN_SLOW:g} to {MAX_SLOW:g}")
+        views: list[View] = [parse_view(text) for text in request.camera]
+        cameras: tuple[Camera, ...] = ()
+        if not views or any(isinstance(view, SceneView) for view in views):
+            cameras = self._cameras()
+            views = views or [SceneView("0") if cameras else OrbitView()]
+        for view in views:
+            if isinstance(view, SceneView):
+                scene_camera(view, cameras)
+        return views, cameras, parse_size(request.size)
+
+    def _cameras(self) -> tuple[Camera, ...]:
+        """The scene's cameras, as refined; the scene itself is read only if they were kept as given."""
+        calibration = Calibration.load(self.path)
+        return self.scene.cameras if calibration is None else calibration.refined
 
     def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
         if truth is None:

@@ -1,8 +1,8 @@
-"""Pictures and a video of a simulated motion, from the scene's own cameras."""
+"""Pictures and a video of a simulated motion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,9 @@ from masiv.progress import Progress, silent
 from masiv.report.draw import backdrop, draw
 from masiv.report.follow import Binding
 from masiv.report.media import write_png, write_video
-from masiv.scene.scene import Scene
+from masiv.report.viewpoints import Viewpoint
+from masiv.scene.camera import Camera
+from masiv.scene.scene import Ground
 
 if TYPE_CHECKING:
     from masiv.splat.gaussians import Gaussians
@@ -22,32 +24,42 @@ LIGHT, DARK = (0.93, 0.62, 0.25), (0.55, 0.30, 0.12)
 
 
 def film(
-    scene: Scene,
+    viewpoints: Sequence[Viewpoint],
     gaussians: Gaussians,
     motion: np.ndarray,
-    views: Sequence[int],
     out: Path,
     *,
+    up: np.ndarray,
+    ground: Ground | None,
+    fps: float,
     progress: Progress = silent,
 ) -> None:
-    """Draw ``motion`` (T, Q, 3) [m] into ``out``/views/VIEW_FRAME.png and ``out``/video.mp4, the views side by side.
+    """Draw ``motion`` (T, Q, 3) [m] into ``out``/views/VIEWPOINT_FRAME.png and ``out``/video.mp4, the viewpoints side
+    by side, ``fps`` pictures a second.
 
     ``gaussians`` are those of frame 0, moved by the particles; the ground is drawn as a chequered plane.
     """
     binding = Binding.at_rest(gaussians, motion[0])
     tile = float(np.ptp(motion[0], axis=0).max()) / 2
-    backgrounds = [backdrop(scene.cameras[view], scene.up, scene.ground, tile) for view in views]
-    map_tasks = []
-    for frame, particles in enumerate(motion):
-        now = binding.moved(particles)
-        pictures = []
-        for view, background in zip(views, backgrounds, strict=True):
-            picture, _ = draw(now, scene.cameras[view], background)
-            write_png(out / "views" / f"{view}_{frame:03d}.png", picture)
-            pictures.append(picture)
-        map_tasks.append(joined(pictures))
-        progress("render", frame + 1, len(motion))
-    write_video(out / "video.mp4", map_tasks, scene.fps)
+    backgrounds: dict[str, tuple[Camera, np.ndarray]] = {}
+
+    def pictures() -> Iterator[np.ndarray]:
+        for frame, particles in enumerate(motion):
+            now = binding.moved(particles)
+            row = []
+            for viewpoint in viewpoints:
+                camera = viewpoint.cameras[frame]
+                known, background = backgrounds.get(viewpoint.name, (None, None))
+                if background is None or known is not camera:
+                    background = backdrop(camera, up, ground, tile)
+                    backgrounds[viewpoint.name] = camera, background
+                picture, _ = draw(now, camera, background)
+                write_png(out / "views" / f"{viewpoint.name}_{frame:03d}.png", picture)
+                row.append(picture)
+            yield joined(row)
+            progress("render", frame + 1, len(motion))
+
+    write_video(out / "video.mp4", pictures(), fps)
 
 
 def balls(particles: np.ndarray, volume: float) -> Gaussians:
