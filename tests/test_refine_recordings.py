@@ -43,7 +43,7 @@ class Thrown:
     """Two effects that push by as much as the body is fast along x, in opposite ways; ``limit`` [m/s] diverges."""
 
     def __init__(self, limit):
-        self.limit = limit
+        self.limit, self.rollouts = limit, 0
         frame = SimulationFrame(np.eye(3), np.zeros(3))
         self.observations = (SimpleNamespace(name="a"),)
         self.setups = (SimpleNamespace(body=SimpleNamespace(axes=frame, frames=4)),)

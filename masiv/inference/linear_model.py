@@ -34,10 +34,12 @@ class LinearModel:
 
 
 def linear_model(
-    forward_model: ForwardModel, model: Model, values: Mapping[str, float], parameters: Sequence[Parameter]
-) -> LinearModel:
-    """``model`` about ``values``: one rollout over all instants, and one a parameter. Raises NonFiniteError."""
-    here = forward_model.fields(model, values, held_out=True)
+    forward_model: ForwardModel, model: Model, values: Mapping[str, float], parameters: Sequence[Parameter],
+    fields: Sequence[np.ndarray] | None = None,
+) -> LinearModel:  # fmt: skip
+    """``model`` about ``values``: one rollout over all instants, and one a parameter. fields: what the first would
+    give, if that is known. Raises NonFiniteError."""
+    here = forward_model.fields(model, values, held_out=True) if fields is None else list(fields)
     together = np.concatenate([f.ravel() for f in here])
     columns = derivatives(ModelResidual(forward_model, model, all_instants=True), values, together, parameters)
     joined = np.stack(columns, axis=1) if columns else np.zeros((len(together), 0))

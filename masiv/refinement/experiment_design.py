@@ -12,6 +12,8 @@ from masiv.models.free_body import FreeBodyModel
 from masiv.progress import Progress
 from masiv.refinement.result import Proposal
 from masiv.refinement.rounds import Round, SearchResult
+from masiv.refinement.tasks import map_tasks
+from masiv.workers import Workers, unwrap
 
 INITIAL_STATES = (
     ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((3.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0)),
@@ -22,7 +24,7 @@ INITIAL_STATES = (
 """Velocities [m/s] and spins [rad/s] that a person could give a body by hand, simulation frame (y up)."""
 
 
-def propose(search: SearchResult, progress: Progress) -> Proposal | None:
+def propose(search: SearchResult, progress: Progress, workers: Workers | None = None) -> Proposal | None:
     """The initial state for which the first accepted effect and its closest rival differ most. None if nothing was
     accepted, if the data distinguishes the two, and if the rollouts of all initial states diverge."""
     first = search.rounds[0] if search.rounds else None
@@ -33,40 +35,47 @@ def propose(search: SearchResult, progress: Progress) -> Proposal | None:
     if rival is None:
         return None
     forward_model = cast(FreeBodyModel, search.forward_model)
-    observation = forward_model.observations[0]
-    body = forward_model.setups[0].body
-    axes, suffix = body.axes, f"@{observation.name}"
-
-    def difference_mm(state: dict[str, float]) -> float:
-        a, b = (forward_model.positions(f.model, {**f.values, **state}, 0, body.frames) for f in (best, rival))
-        return 1e3 * float((a - b).square().sum(2).mean().sqrt())
-
-    differences, failures = [], []
-    for done, (velocity, omega) in enumerate(INITIAL_STATES):
-        progress("refine: propose an initial state", done, len(INITIAL_STATES))
+    axes, suffix = forward_model.setups[0].body.axes, f"@{forward_model.observations[0].name}"
+    states = [{}]  # as it was
+    for velocity, omega in INITIAL_STATES:
         state = {f"velocity_{a}{suffix}": v for a, v in zip("xyz", velocity, strict=True)}
-        state |= {f"omega_{a}{suffix}": v for a, v in zip("xyz", omega, strict=True)}
-        try:
-            differences.append((difference_mm(state), velocity, omega))
-        except NonFiniteError as error:
+        states.append(state | {f"omega_{a}{suffix}": v for a, v in zip("xyz", omega, strict=True)})
+    found: list[float | str] = []
+    tasks = [(best, rival, state) for state in states]
+    for done, difference in enumerate(map_tasks(workers or Workers(), forward_model, _difference_mm, tasks)):
+        progress("refine: propose an initial state", done + 1, len(states))
+        found.append(unwrap(difference))
+    present, *others = found
+    differences, failures = [], []
+    for (velocity, omega), difference in zip(INITIAL_STATES, others, strict=True):
+        if isinstance(difference, str):
             world = (axes.vectors_to_world(np.array(v)) for v in (velocity, omega))
-            failures.append((*world, error.detail))
-    progress("refine: propose an initial state", len(INITIAL_STATES), len(INITIAL_STATES))
+            failures.append((*world, difference))
+        else:
+            differences.append((difference, velocity, omega))
     if not differences:
         return None
-    try:
-        present = difference_mm({})
-    except NonFiniteError:
-        present = None
     difference, velocity, omega = max(differences)
     return Proposal(
         (best.model.effects[-1], rival.model.effects[-1]),
         axes.vectors_to_world(np.array(velocity)),
         axes.vectors_to_world(np.array(omega)),
         difference,
-        present,
+        None if isinstance(present, str) else present,
         tuple(failures),
     )
+
+
+def _difference_mm(
+    forward_model: FreeBodyModel, best: ModelFit, rival: ModelFit, state: dict[str, float]
+) -> float | str:
+    """Root mean square distance [mm] of two fits that start as ``state`` says, or why they cannot be simulated."""
+    frames = forward_model.setups[0].body.frames
+    try:
+        a, b = (forward_model.positions(f.model, {**f.values, **state}, 0, frames) for f in (best, rival))
+    except NonFiniteError as error:
+        return error.detail
+    return 1e3 * float((a - b).square().sum(2).mean().sqrt())
 
 
 def _rival(first: Round, best: ModelFit) -> ModelFit | None:

@@ -93,5 +93,5 @@ def refine_recordings(
         fits = baselines(forward_model, problem, config, checkpoint or Checkpoint(None), progress, workers)
         settings = SearchSettings.of(config, rank_only=dry_run, workers=workers, progress=progress)
         result = refine(forward_model, fits, settings)
-        proposal = None if dry_run else propose(result.search, progress)
+        proposal = None if dry_run else propose(result.search, progress, workers)
         return replace(result, proposal=proposal)

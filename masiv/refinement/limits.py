@@ -46,7 +46,8 @@ def sensitivity(
     NonFiniteError."""
     term = forward_model.term(name)
     values = {**absent(term, at.values), **{p.name: places.get(p.name, p.start) for p in term.others}}
-    return values, linear_model(forward_model, at.model.with_effect(name), values, term.strengths)
+    fields = None if term.replaces_parameter else at.fields  # the effect is absent, and nothing else is in its place
+    return values, linear_model(forward_model, at.model.with_effect(name), values, term.strengths, fields)
 
 
 def upper_limit(
