@@ -253,6 +253,7 @@ class VideoRun(Run):
         scene = self.scene if self.scene_path.exists() else None
         self.start()
         from masiv.report.numbers import evaluation_numbers, table
+        from masiv.report.video import write_report
         from masiv.twin import Twin
 
         dynamic, trajectory = stages.load_gaussians(self.folder), stages.load_trajectory(self.folder)
@@ -265,6 +266,9 @@ class VideoRun(Run):
                 self.folder, scene, dynamic, trajectory, twin, rollout, truth, progress=progress
             )
             write_json(self.folder.evaluation, numbers)
+            metrics = stages.read_metrics(self.folder)
+            if scene is not None and twin is not None and rollout is not None and metrics is not None:
+                write_report(self.folder, scene, dynamic, trajectory, twin, rollout, metrics)
         text = f"{table(numbers)}\n{self.folder.evaluation}"
         if scene is None:
             text += f"\nno pictures were compared: the scene is not at {self.scene_path}, say where it is with --scene"

@@ -12,11 +12,11 @@ from masiv.refinement.support import question
 
 
 def with_scopes(document: Mapping[str, Any]) -> dict[str, Any]:
-    """``document`` with effects named by whom they act on, too, for people."""
+    """``document`` with effects named by whom they act on, too, for people; their scope is then no more told apart."""
 
     def named(row: Mapping[str, Any]) -> dict[str, Any]:
         scope = row.get("scope") or "all"
-        return dict(row) if scope == "all" else {**row, "effect": f"{row['effect']} ({scope})"}
+        return dict(row) if scope == "all" else {**row, "effect": f"{row['effect']} ({scope})", "scope": "all"}
 
     rounds = [{**r, "refits": [named(t) for t in r["refits"]]} for r in document["rounds"]]
     return {

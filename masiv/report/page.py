@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import base64
 import html
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from masiv.files import write_text
+from masiv.report.charts import Chart
 
-STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;max-width:1100px;margin:2rem auto;padding:0 1rem;color:#1c2430;background:#fff}
-h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.15rem;margin:2rem 0 .6rem;border-bottom:1px solid #d8dde4}
-table{border-collapse:collapse;margin:.5rem 0}th,td{padding:.3rem .9rem .3rem 0;text-align:left;vertical-align:top}
-th{font-weight:600;border-bottom:1px solid #9aa4b1}td{border-bottom:1px solid #e6e9ee}
-td.n{text-align:right;font-variant-numeric:tabular-nums}
-td.bar{min-width:9rem;white-space:nowrap}td.bar i{display:inline-block;height:.7em;margin-right:.5em;background:#2563a8}
-h3{font-size:1rem;margin:1.4rem 0 .2rem}img,video{max-width:100%;height:auto}.note{color:#5b6675;font-size:.9rem}
-"""
+LONG = 30
+"""Letters from which on a cell of a table is a text of several lines."""
+NO_SCRIPT = "<noscript><p>Plots and the 3D view need JavaScript. All of it is in this file.</p></noscript>"
 
 
 @dataclass(frozen=True)
@@ -30,12 +28,23 @@ class Share:
     value: float
 
 
+@dataclass(frozen=True)
+class Card:
+    """A question, its answer in a few words, and lines that say more. open: the answer is not known, or not good."""
+
+    question: str
+    answer: str
+    lines: Sequence[str] = ()
+    open: bool = False
+
+
 @dataclass
 class Page:
-    """Collects sections, then ``write``. Text is escaped; pictures and videos are embedded."""
+    """Collects sections, then ``write``. Text is escaped; pictures and scripts are embedded."""
 
     title: str
     parts: list[str] = field(default_factory=list)
+    data: dict[str, Any] = field(default_factory=dict)
 
     def heading(self, text: str) -> None:
         self.parts.append(f"<h2>{html.escape(text)}</h2>")
@@ -43,32 +52,98 @@ class Page:
     def subheading(self, text: str) -> None:
         self.parts.append(f"<h3>{html.escape(text)}</h3>")
 
+    def text(self, text: str) -> None:
+        self.parts.append(f"<p>{html.escape(text)}</p>")
+
     def note(self, text: str) -> None:
         self.parts.append(f'<p class="note">{html.escape(text)}</p>')
 
+    def cards(self, cards: Sequence[Card]) -> None:
+        shown = []
+        for card in cards:
+            lines = "".join(f"<p>{html.escape(line)}</p>" for line in card.lines)
+            kind = "card open" if card.open else "card"
+            shown.append(
+                f'<section class="{kind}"><h2>{html.escape(card.question)}</h2>'
+                f"<strong>{html.escape(card.answer)}</strong>{lines}</section>"
+            )
+        self.parts.append(f'<div class="cards">{"".join(shown)}</div>')
+
     def table(self, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         """Numbers are right-aligned and shown with four significant digits; None is a dash."""
-        head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
+        numeric = [bool(rows) and all(_is_number(row[k]) or row[k] is None for row in rows) for k in range(len(header))]
+        head = "".join(
+            f"<th{_NUMERIC if right else ''}>{html.escape(name)}</th>"
+            for name, right in zip(header, numeric, strict=True)
+        )
         body = "".join("<tr>" + "".join(_cell(value) for value in row) + "</tr>" for row in rows)
-        self.parts.append(f"<table><tr>{head}</tr>{body}</table>")
+        self.parts.append(f'<div class="scroll"><table><tr>{head}</tr>{body}</table></div>')
 
     def picture(self, png: bytes, alt: str) -> None:
-        self.parts.append(f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{_encoded(png)}">')
+        self.pictures([(png, alt)])
 
-    def video(self, mp4: bytes, caption: str) -> None:
-        source = f"data:video/mp4;base64,{_encoded(mp4)}"
-        self.parts.append(f'<video controls autoplay loop muted playsinline src="{source}"></video>')
-        self.note(caption)
+    def pictures(self, pictures: Sequence[tuple[bytes, str]]) -> None:
+        """PNG files of one size with what they show, as many in a row as fit."""
+        shown = "".join(
+            f'<figure><img alt="{html.escape(alt)}" src="data:image/png;base64,{encoded(png)}"></figure>'
+            for png, alt in pictures
+        )
+        self.parts.append(f'<div class="grid">{shown}</div>')
+
+    def charts(self, charts: Sequence[Chart]) -> None:
+        """Charts of one size, as many in a row as fit."""
+        shown = "".join(self.chart_figure(chart) for chart in charts)
+        self.parts.append(f'<div class="grid">{shown}</div>')
+
+    def chart_figure(self, chart: Chart) -> str:
+        """The markup of one, to be put somewhere; its data is in the page."""
+        known = self.data.setdefault("charts", [])
+        known.append(chart.data())
+        marks = "".join(
+            f'<li><i class="{kind}" style="--mark:{colour}"></i>{html.escape(name)}</li>'
+            for kind, colour, name in chart.legend
+        )
+        legend = f'<ul class="legend">{marks}</ul>' if marks else ""
+        note = f"<figcaption>{html.escape(chart.note)}</figcaption>" if chart.note else ""
+        title = html.escape(chart.title)
+        return (
+            f'<figure><h4>{title}</h4><div class="chart" data-chart="{len(known) - 1}" role="img" aria-label="{title}">'
+            f"</div>{legend}{note}</figure>"
+        )
+
+    def script(self, markup: str, **data: Any) -> None:
+        """Add ``markup`` (HTML, not escaped) and the ``data`` that report.js fills it with."""
+        self.parts.append(markup)
+        self.data |= data
+
+    @contextmanager
+    def folded(self, title: str) -> Iterator[None]:
+        """What is added meanwhile is closed at first."""
+        self.parts.append(f"<details><summary>{html.escape(title)}</summary>")
+        yield
+        self.parts.append("</details>")
 
     def write(self, path: Path) -> None:
         """Write the page, completely or not at all."""
         title = html.escape(self.title)
         text = (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width,initial-scale=1">'
-            f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>{''.join(self.parts)}</body></html>"
+            '<meta name="viewport" content="width=device-width,initial-scale=1"><link rel="icon" href="data:,">'
+            f"<title>{title}</title><style>{_web('report.css')}</style></head><body><h1>{title}</h1>"
+            f"{''.join(self.parts)}{self._scripts()}</body></html>"
         )
         write_text(path, text)
+
+    def _scripts(self) -> str:
+        """Nothing for a page without charts."""
+        if not self.data:
+            return ""
+        from masiv.report.library import packed_library
+
+        return (
+            f'{NO_SCRIPT}<script type="application/json" id="data">{as_json(self.data)}</script>'
+            f'<script type="text/plain" id="library">{packed_library()}</script><script>{_web("report.js")}</script>'
+        )
 
 
 def number(value: Any) -> str:
@@ -84,13 +159,39 @@ def number(value: Any) -> str:
     return str(value)
 
 
+def encoded(data: bytes) -> str:
+    """base64."""
+    return base64.b64encode(data).decode("ascii")
+
+
+def as_json(data: Mapping[str, Any]) -> str:
+    """JSON that can stand in a page: no markup; numbers that are not finite are null."""
+    return json.dumps(_finite(data), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+_NUMERIC = ' class="n"'
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def _cell(value: Any) -> str:
     if isinstance(value, Share):
         width = 6 * min(max(value.value, 0.0), 1.0)
         return f'<td class="bar"><i style="width:{width:.2f}rem"></i>{100 * value.value:.0f} %</td>'
-    kind = ' class="n"' if isinstance(value, (int, float)) and not isinstance(value, bool) else ""
-    return f"<td{kind}>{html.escape(number(value))}</td>"
+    text = number(value)
+    kind = _NUMERIC if _is_number(value) else ' class="long"' if len(text) > LONG else ""
+    return f"<td{kind}>{html.escape(text)}</td>"
 
 
-def _encoded(data: bytes) -> str:
-    return base64.b64encode(data).decode("ascii")
+def _web(name: str) -> str:
+    return (resources.files("masiv.report") / "web" / name).read_text(encoding="utf-8")

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from masiv.errors import InputError
+from masiv.refinement.answer import words
+from masiv.report.quantities import quantity
 from masiv.strict import read_json
 
 if TYPE_CHECKING:
@@ -31,10 +33,10 @@ def read_material(run: Path) -> dict[str, Any] | None:
 
 def material_section(page: Page, material: Mapping[str, Any]) -> None:
     """Add the section of ``material`` (the content of material.json) to ``page``."""
-    from masiv.report import plots
+    from masiv.report.law_charts import material_charts
 
     page.heading("What is this material?")
-    page.note(material["summary"])
+    page.text(material["summary"])
     page.table(
         ["quantity", "value", "unit", "standard error [%]", "note"],
         [
@@ -42,13 +44,13 @@ def material_section(page: Page, material: Mapping[str, Any]) -> None:
             for name, q in material["quantities"].items()
         ],
     )
-    page.picture(plots.material_curves(material["curves"]), "responses of the law and of the nearest classical law")
+    page.charts(material_charts(material["curves"]))
     page.note(
         "Grey: strains that this motion did not show, where the law is a guess. Dashed: the nearest classical law."
     )
     page.table(
         ["classical law", "residual [%]", "its best parameters"],
-        [[m["kind"], _number(m["misfit_percent"]), _parameters(m["parameters"])] for m in material["families"]],
+        [[words(m["kind"]), _number(m["misfit_percent"]), _parameters(m["parameters"])] for m in material["families"]],
     )
     if material["sensitivities"]:
         page.table(
@@ -69,6 +71,4 @@ def _number(value: Any) -> float | None:
 
 
 def _parameters(parameters: Mapping[str, Mapping[str, Any]]) -> str:
-    return ", ".join(
-        f"{n.replace('_', ' ')} {v['value']:.3g} {v['unit'].strip('1')}".strip() for n, v in parameters.items()
-    )
+    return ", ".join(f"{words(n)} {quantity(v['value'], v['unit'])}" for n, v in parameters.items())

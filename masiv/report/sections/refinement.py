@@ -13,8 +13,10 @@ from masiv.files import read_npz
 from masiv.refinement.answer import answer, outcome, words
 from masiv.refinement.support import question
 from masiv.report import plots
-from masiv.report.force_plot import force_in_time_and_space
+from masiv.report.force_plot import force_in_space
 from masiv.report.page import Page, Share, number
+from masiv.report.quantities import percent
+from masiv.report.time_charts import force_in_time, residual_in_time
 from masiv.strict import read_json
 
 REFINED, FIELDS = "refine.json", "refine.npz"
@@ -40,7 +42,7 @@ def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | No
         document = read_json(run / REFINED)
         file = read_npz(run / FIELDS)
         first = str(file["observations"][0])
-        names = ("before", "after", "points", "times", "fit_count", "test_count")
+        names = ("before", "after", "observed", "points", "times", "fit_count", "test_count")
         fields = {name: file[f"{name}@{first}"] for name in names}
         fields |= {name: file[f"{name}@{first}"] for name in FORCE if f"{name}@{first}" in file}
     except (InputError, KeyError, IndexError) as error:
@@ -60,7 +62,7 @@ def refinement_section(
     upwards in the world, for the views."""
     title = "Closing the loop: what does the model lack?"
     page.heading(f"{title} Condition {document['condition']}" if document.get("condition") else title)
-    page.note(_verdict(document))
+    page.text(_verdict(document))
     if fields is not None:
         _figures(page, document, fields, up)
     _causes(page, document["candidates"])
@@ -94,7 +96,7 @@ def _verdict(document: Mapping[str, Any]) -> str:
     if laws["after"] != laws["before"]:
         law += f", then {words(laws['after'])}"
     errors = [
-        f"{label} {_mm(document['before'], split)} → {_mm(document['after'], split)} mm"
+        f"{label} {_change(_mm(document['before'], split), _mm(document['after'], split))} mm"
         for split, label in PARTS.items()
         if document["before"].get(split)
     ]
@@ -106,13 +108,17 @@ def _verdict(document: Mapping[str, Any]) -> str:
     )
 
 
+def _change(before: str, after: str) -> str:
+    return before if before == after else f"{before} → {after}"
+
+
 def _probabilities(document: Mapping[str, Any]) -> str:
     p, unknown = document["null_probability"], document["unknown_probability"]
     check, test = document["predictive_p"]["after"], document["test"].get("after")
     expected = "" if test is None else f"The final model expects {number(test['expected_rmse_mm'])} mm on the test. "
     return (
-        f"Probability that no effect acts: {number(p)}; that something unknown acts: {number(unknown)}; of so large a "
-        f"residual with nothing missing: {number(check)}. {expected}"
+        f"Probability that no effect acts: {percent(p)}; that something unknown acts: {percent(unknown)}; of so "
+        f"large a residual with nothing more missing: {percent(check)}. {expected}"
     )
 
 
@@ -133,20 +139,16 @@ def _figures(page: Page, document: Mapping[str, Any], fields: Mapping[str, np.nd
     names = ("before", "after") if added else ("before",)
     shown = {name if added else "without effects": fields[name] for name in names}
     times = fields["times"]
-    page.picture(
-        plots.residual_in_time(
-            shown, times, int(fields["fit_count"]), int(fields["test_count"]), document["noise_floor_mm"]
-        ),
-        "residual in time",
-    )
-    page.note(
+    note = (
         "The gap between the curves is what the added effect explains. Frames for validation are not fitted and take "
         "part in the choice of effects; nothing has seen those of the test. What stays above the dashed line is no "
         "noise."
         if added
         else "A curve near the dashed line leaves nothing to explain; one that grows away from it is missing physics."
     )
-    page.picture(plots.residual_in_space(shown, fields["points"], times, up), "residual in space")
+    counts = int(fields["fit_count"]), int(fields["test_count"])
+    page.charts([residual_in_time(shown, times, *counts, document["noise_floor_mm"], note)])
+    page.pictures(plots.residual_in_space(shown, fields["points"], times, up))
     page.note(
         "Particles at frame 0. An even colour is an error of the whole body, a bright spot one of a part; arrows point "
         "from the observed to the simulated position."
@@ -318,8 +320,9 @@ def _discrepancy_force(
     )
     if fields is not None and "force" in fields:
         counts = int(fields["fit_count"]), int(fields["test_count"])
-        drawn = force_in_time_and_space(fields["force"], fields["force_places"], fields["times"], *counts, up)
-        page.picture(drawn, "discrepancy force")
+        found = fields["force"], fields["force_places"], fields["times"]
+        page.charts([force_in_time(*found, *counts)])
+        page.pictures(force_in_space(*found, counts[0], up))
 
 
 def _next_experiment(page: Page, proposal: Mapping[str, Any] | None) -> None:
@@ -346,4 +349,4 @@ def _number(value: Any) -> float | None:
 
 
 def _unit(unit: str) -> str:
-    return "" if unit == "1" else unit
+    return "" if unit == "1" else unit.replace("^2", "²")

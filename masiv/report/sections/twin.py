@@ -43,13 +43,15 @@ def _rows(twin: Twin) -> list[list[Any]]:
     rows.append(["law", law["kind"], "", None])
     for name, row in law.get("parameters", {}).items():
         rows.append([name.replace("_", " "), row["value"], row["unit"], row.get("stderr")])
-    fit = twin.fit if "refined" not in twin.fit else twin.fit["refined"]  # the rest is of the law before
-    rows += [
-        [name.replace("_", " "), value, "", None]
-        for name, value in fit.items()
-        if name not in ("history", VOLUME_ERROR)
-    ]
     return rows
+
+
+def fit_table(page: Page, twin: Twin) -> None:
+    """What the fit noted of itself: keys of ``fit`` in twin.yaml."""
+    fit = twin.fit if "refined" not in twin.fit else twin.fit["refined"]  # the rest is of the law before
+    rows = [[name.replace("_", " "), value] for name, value in fit.items() if name not in ("history", VOLUME_ERROR)]
+    if rows:
+        page.table(["key of twin.yaml, fit", "value"], rows)
 
 
 def effects_table(page: Page, twin: Twin) -> None:
