@@ -63,7 +63,7 @@ def write_run(folder: Path) -> RunFolder:
     ).save(folder)  # fmt: skip
     write_json(folder / MATERIAL, {"schema": 1, "summary": "soft"})
     write_json(folder / REFINED, {"schema": 4})
-    names = ("before", "after", "points", "times", "fit_count", "test_count")
+    names = ("before", "after", "observed", "points", "times", "fit_count", "test_count")
     write_npz(folder / FIELDS, observations=["a"], **{f"{name}@a": np.zeros(3) for name in names})
     write_json(run.metrics, {"schema": 1})
     KeptMasks(run.masks, KEY).write("view_0_0000", {0: np.ones((4, 4), np.float32)})
@@ -71,14 +71,14 @@ def write_run(folder: Path) -> RunFolder:
     return run
 
 
-def write_scene(folder: Path) -> Path:
+def write_scene(folder: Path, frames: int = 2) -> Path:
     """A scene in the layout of PAC-NeRF: two cameras that face each other, and scene.yaml."""
     import cv2
 
     (folder / "data").mkdir(parents=True)
     rows = []
     for view, sign in ((0, 1.0), (1, -1.0)):
-        for frame in range(2):
+        for frame in range(frames):
             image = np.full((32, 32, 3), 90, np.uint8)
             image[8 + frame : 18 + frame, 10:20] = (20, 20, 220)
             cv2.imwrite(str(folder / f"data/r_{view}_{frame}.png"), image)

@@ -8,12 +8,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
-from masiv.report import history, measure, plots
+from masiv.report import history, measure
 from masiv.report.draw import backdrop, draw
 from masiv.report.follow import Binding
+from masiv.report.library import packed_library
 from masiv.report.media import write_png, write_video
 from masiv.report.numbers import rows, table
 from masiv.report.page import Page, number
+from masiv.report.time_charts import convergence, over_time
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Ground
 from masiv.splat.gaussians import Gaussians
@@ -81,24 +83,43 @@ def test_log_gives_back_the_reported_numbers(tmp_path):
     report("fit", 5, 5, "loss 9.5 mm over 9 frames")  # a resumed run repeats
     for k, word in enumerate(("jelly", "sand", "water")):
         report("choice", k, 3, f"{word} {k} mm")
-    iterations, values, label = history.curves(tmp_path / "log.csv")["fit"]
-    assert iterations == [1, 2, 3, 4, 5]
-    assert values == [1, 0.5, 0.333, 0.25, 9.5]
-    assert label == "loss mm over frames"
+    found = history.curves(tmp_path / "log.csv")["fit"]
+    assert found.iterations == [1, 2, 3, 4, 5]
+    assert found.values == [1, 0.5, 0.333, 0.25, 9.5]
+    assert found.label == "loss mm"
+    assert found.frames == [1, 2, 3, 4, 9]
     assert "choice" not in history.curves(tmp_path / "log.csv")
+
+
+def test_convergence_is_apart_for_each_number_of_frames(tmp_path):
+    """The error jumps where frames are added: no line joins the two sides, and a band gives their number."""
+    report = history.logged(lambda *a: None, tmp_path / "log.csv")
+    for k, (value, frames) in enumerate(((4, 5), (3, 5), (7, 6), (6, 6)), start=1):
+        report("identify: fit", k, 4, f"{value} mm over {frames} frames")
+    for k in (1, 2, 3):
+        report("reconstruct", k, 3, f"loss {1 / k}, 12 frames")
+    found = history.curves(tmp_path / "log.csv")
+    chart = convergence("identify: fit", found["identify: fit"]).data()
+    assert [line["x"] for line in chart["lines"]] == [[1, 2], [3, 4]]
+    assert [(band["name"], band["from"], band["to"]) for band in chart["bands"]] == [("5", 0.5, 2.5), ("6", 2.5, 4.5)]
+    assert chart["y"] == "distance [mm]"
+    assert "no divergence" in convergence("identify: fit", found["identify: fit"]).note
+    assert convergence("reconstruct", found["reconstruct"]).note == ""  # always as many frames
 
 
 def test_page_is_self_contained_and_escapes(tmp_path):
     page = Page("a <twin>")
     page.table(["x"], [[1.23456], [None], ["<b>"], [[0.5, 2]]])
-    page.picture(plots.over_frames({"a": ([0, 1], [1.0, None])}, "t", "mm", 1), "plot")
+    page.charts([over_time({"a": ([0, 1], [1.0, None])}, "t </script>", "mm")])
     page.write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     assert "a &lt;twin&gt;" in text
     assert "1.235" in text
     assert "(0.5, 2)" in text
     assert "<b>" not in text
-    assert "http" not in text
+    scripts = text[text.index('<script type="application/json"') :]
+    assert "http" not in text.replace(packed_library(), "")
+    assert scripts.count("</script>") == 3  # data, library, report.js: none ends early
     assert number(float("inf")) == "∞"
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from masiv.splat.dynamic import DynamicGaussians
 
 VIEWS = 4
-MAX_BYTES = 1_000_000
+MAX_BYTES = 900_000
 """Of all cameras together, before base64."""
 SETTINGS = ((360, 85), (360, 70), (240, 75), (180, 70), (120, 60))
 """Largest height of a picture [px] and quality of WebP; the first that is small enough."""

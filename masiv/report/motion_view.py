@@ -15,7 +15,7 @@ from masiv.subsample import kd_tree_subset
 MAX_POINTS = 2000
 MAX_INSTANTS = 60
 """That are shown of a motion."""
-MAX_BYTES = 450_000
+MAX_BYTES = 400_000
 """Of all motions together, before base64."""
 BYTES_PER_POINT = 14
 """Two places of three numbers and an error, 2 bytes each."""
