@@ -81,7 +81,7 @@ def _made_of(twin: Twin, material: Mapping[str, Any] | None) -> Card:
             nearest = min(material["families"], key=lambda f: f["misfit_percent"], default=None)
             if nearest is not None:
                 kind = LAWS.get(nearest["kind"], words(nearest["kind"]))
-                lines.append(f"A learnt law; nearest classical one: {kind}, {nearest['misfit_percent']:.0f} % off.")
+                lines.append(f"A learnt law; nearest classical one: {kind}, its stresses differ by {nearest['misfit_percent']:.0f} %.")
     return Card(question, _upper(answer), lines)
 
 

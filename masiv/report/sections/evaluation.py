@@ -39,7 +39,9 @@ def true_errors(evaluation: Mapping[str, Any] | None) -> list[tuple[str, np.ndar
 
 def evaluation_section(page: Page, evaluation: Mapping[str, Any]) -> None:
     page.heading("Against the true motion")
-    page.table(*rows(evaluation["motion"]))
+    header, body = rows(evaluation["motion"])
+    used = [k for k, _ in enumerate(header) if any(row[k] is not None for row in body)]
+    page.table([header[k] for k in used], [[row[k] for k in used] for row in body])
     page.note(
         f"masiv evaluate, {evaluation['truth']['particles']} true particles. Tracked: mean distance of each particle "
         "from the true place of its material. The rigid bodies are baselines without any deformation. Chamfer "

@@ -135,7 +135,7 @@ class Space {
   eye() { // from where the view looks at first: obliquely from above
     const up = this.data.up, k = up.map(Math.abs).indexOf(Math.max(...up.map(Math.abs)));
     const [a, b] = [[1, 2], [2, 0], [0, 1]][k];
-    const far = this.box.clientWidth < 500 ? 1.6 : 1.2;
+    const far = this.box.clientWidth < 500 ? 2 : 1.2;
     const eye = up.map((value) => 0.55 * far * value);
     eye[a] += 0.55 * far;
     eye[b] += 0.84 * far;
