@@ -81,7 +81,8 @@ def _made_of(twin: Twin, material: Mapping[str, Any] | None) -> Card:
             nearest = min(material["families"], key=lambda f: f["misfit_percent"], default=None)
             if nearest is not None:
                 kind = LAWS.get(nearest["kind"], words(nearest["kind"]))
-                lines.append(f"A learnt law; nearest classical one: {kind}, its stresses differ by {nearest['misfit_percent']:.0f} %.")
+                misfit = f"{nearest['misfit_percent']:.0f} %"
+                lines.append(f"A learnt law; nearest classical one: {kind}, whose stresses differ by {misfit}.")
     return Card(question, _upper(answer), lines)
 
 
