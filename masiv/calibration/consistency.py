@@ -52,18 +52,31 @@ def silhouette_consistency(scene: Scene) -> Consistency:
 
 def pair_errors(cameras: list[Camera], outlines: list[list[Outline | None]]) -> np.ndarray:
     """``Consistency.pairs`` of V cameras and their outlines, V lists over the same frames."""
-    pairs = np.full((len(cameras), len(cameras)), np.nan)
+    return pairs_of(tangency_series(cameras, outlines))
+
+
+def tangency_series(cameras: list[Camera], outlines: list[list[Outline | None]]) -> np.ndarray:
+    """``tangency_errors`` (V, V, F, 2) [pixels of the first camera] of all pairs at F frames; NaN if unknown."""
+    count = len(cameras)
+    series = np.full((count, count, len(outlines[0]) if outlines else 0, 2), np.nan)
     for i, camera in enumerate(cameras):
         for j, other in enumerate(cameras):
-            found = [
-                tangency_errors(camera, mine, other, its)
-                for mine, its in zip(outlines[i], outlines[j], strict=True)
-                if i != j and mine is not None and its is not None
-            ]
-            if found:
-                # The calibration is the same in all frames: the median is not moved by a frame with a bad mask.
-                pairs[i, j] = _rms_of_medians(found)
-    return pairs
+            if i == j:
+                continue
+            for frame, (mine, its) in enumerate(zip(outlines[i], outlines[j], strict=True)):
+                if mine is not None and its is not None:
+                    series[i, j, frame] = tangency_errors(camera, mine, other, its)
+    return series
+
+
+def pairs_of(series: np.ndarray) -> np.ndarray:
+    """``Consistency.pairs`` of ``tangency_series``: RMS over the two tangents of the median over the frames.
+
+    The calibration is the same in all frames: the median is not moved by a frame with a bad mask.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # all are NaN
+        return np.sqrt(np.nanmean(np.nanmedian(np.abs(series), axis=2) ** 2, axis=2))
 
 
 def consistency(views: tuple[int, ...], pairs: np.ndarray) -> Consistency:
@@ -93,13 +106,6 @@ def odd_camera(scene: Scene, found: Consistency) -> str | None:
         f"cameras by {error:.1f} px, the others among themselves by {found.others:.1f} px: check its pose, focal "
         "length, clock and masks"
     )
-
-
-def _rms_of_medians(errors: list[np.ndarray]) -> float:
-    """RMS over the two tangents of the median over the frames. errors: F arrays (2,), NaN for unknown tangents."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # all are NaN
-        return float(np.sqrt(np.nanmean(np.nanmedian(np.abs(errors), axis=0) ** 2)))
 
 
 def _median(values: np.ndarray) -> float:

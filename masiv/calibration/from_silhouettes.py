@@ -49,14 +49,16 @@ class SilhouetteFit:
     """Corrections of V cameras, in the order of ``Scene.views``.
 
     corrections: about ``pivot`` (3,) [m]. points: of the object. standard_errors_px (V,): of the corrections that are
-    left without the gauge, as RMS displacement of the object. inconsistency (V,) [pixels]: of the corrected cameras,
-    ``Consistency.pixels``. noise_px: scale of the outlines' errors.
+    left without the gauge, as RMS displacement of the object. clock_errors (V,) [s]: standard error of a clock against
+    the mean of the others. inconsistency (V,) [pixels]: of the corrected cameras, ``Consistency.pixels``. noise_px:
+    scale of the outlines' errors.
     """
 
     corrections: tuple[CameraCorrection, ...]
     pivot: np.ndarray
     points: np.ndarray
     standard_errors_px: tuple[float, ...]
+    clock_errors: np.ndarray
     inconsistency: np.ndarray
     noise_px: float
 
@@ -97,10 +99,12 @@ def fit_silhouettes(
     for k, jacobian in enumerate(problem.displacements):
         block = covariance[POSE * k : POSE * (k + 1), POSE * k : POSE * (k + 1)]
         errors.append(float(np.sqrt(np.einsum("pij,jk,pik->", jacobian, block, jacobian) / len(jacobian))))
+    others = np.eye(len(cameras)) - (1 - np.eye(len(cameras))) / max(len(cameras) - 1, 1)
+    clocks = np.einsum("ij,jk,ik->i", others, covariance[POSE - 1 :: POSE, POSE - 1 :: POSE], others)
     corrections = tuple(CameraCorrection(row[:3], row[3:6], float(row[6]), float(row[7])) for row in found)
     corrected = [corrected_camera(*one, points.pivot) for one in zip(cameras, corrections, strict=True)]
     left = consistency(tuple(range(len(cameras))), pair_errors(corrected, [list(o) for o in outlines]))
-    return SilhouetteFit(corrections, points.pivot, points.points, tuple(errors), left.pixels, noise)
+    return SilhouetteFit(corrections, points.pivot, points.points, tuple(errors), np.sqrt(clocks), left.pixels, noise)
 
 
 class _Problem:

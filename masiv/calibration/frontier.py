@@ -109,6 +109,25 @@ def tangency_residuals(
     return TangencyResiduals(pairs, angles, pixel_angles, jacobian, groups)
 
 
+def tangent_angles(cameras: Sequence[Camera], outlines: Outlines, pair: tuple[int, int]) -> np.ndarray:
+    """Angles (2, F, 2) [rad] about the baseline of the two planes that touch the outline of each camera of ``pair``
+    (i, j), against one plane of reference; NaN if unknown."""
+    one, other = (_view(cameras[k], np.zeros(POSE), np.zeros(3), outlines.hulls[k], outlines.cuts[k]) for k in pair)
+    baseline = other.camera.centre - one.camera.centre
+    length = float(np.linalg.norm(baseline))
+    if length < 1e-9:
+        return np.full((2, len(outlines.frames), 2), np.nan)
+    axis = baseline / length
+    seen = np.concatenate([one.rays.reshape(-1, 3), other.rays.reshape(-1, 3)])
+    across = np.nanmean(seen / np.linalg.norm(seen, axis=1, keepdims=True), axis=0)
+    across = across - (across @ axis) * axis
+    found = []
+    for view, (ends, known) in zip((one, other), _tangent_points(axis, one, other), strict=True):
+        touching = np.take_along_axis(view.rays, ends[..., None], 1)
+        found.append(np.where(known, np.arctan2(touching @ np.cross(axis, across), touching @ across), np.nan))
+    return np.stack(found)
+
+
 def _view(camera: Camera, row: np.ndarray, pivot: np.ndarray, hulls: np.ndarray, cuts: np.ndarray) -> _View:
     given = camera.world_to_camera
     corrected = corrected_camera(camera, CameraCorrection(row[:3], row[3:6], float(row[6]), float(row[7])), pivot)

@@ -26,21 +26,26 @@ class OutlinePoints:
     velocities: np.ndarray
 
 
-def outline_points(cameras: Sequence[Camera], outlines: Outlines, fps: float) -> OutlinePoints | None:
-    """Of V cameras. The centre at a frame is the point nearest to the rays through the middles of the outlines; None if
-    no frame has two."""
+def ray_centres(cameras: Sequence[Camera], outlines: Outlines) -> tuple[np.ndarray, np.ndarray]:
+    """Index (K,) of the frames that two of V cameras show, and the object's centre (K, 3) [m] in them: the point
+    nearest to the rays through the middles of the outlines."""
     if not outlines.hulls.size:
-        return None
+        return np.zeros(0, int), np.zeros((0, 3))
     rays = [world_rays(camera, hulls) for camera, hulls in zip(cameras, outlines.hulls, strict=True)]
     middles = _unit(np.stack(rays).mean(axis=2))
     seen = np.asarray(np.isfinite(middles).all(axis=-1))
     frames = np.flatnonzero(seen.sum(axis=0) >= 2)
-    if not len(frames):
-        return None
     along = np.where(seen[..., None], middles, 0)[:, frames]
     across = seen[:, frames, None, None] * (np.eye(3) - along[..., :, None] * along[..., None, :])
     total = np.einsum("vfij,vj->fi", across, np.stack([camera.centre for camera in cameras]))
-    centres = (np.linalg.pinv(across.sum(axis=0)) @ total[..., None])[..., 0]
+    return frames, (np.linalg.pinv(across.sum(axis=0)) @ total[..., None])[..., 0]
+
+
+def outline_points(cameras: Sequence[Camera], outlines: Outlines, fps: float) -> OutlinePoints | None:
+    """Of V cameras, about their ``ray_centres``; None if no frame has one."""
+    frames, centres = ray_centres(cameras, outlines)
+    if not len(frames):
+        return None
     velocities = np.zeros_like(centres)
     if len(frames) > 1:
         velocities = np.gradient(centres, outlines.frames[frames] / fps, axis=0)

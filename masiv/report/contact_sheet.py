@@ -1,38 +1,59 @@
-"""One picture of a scene: a row a view, a column a frame, the mask's outline drawn. Point clouds from two sides."""
+"""One picture of a scene: a row a view, a column a frame, with the mask's outline, the up axis and the ground. Point
+clouds from two sides."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from masiv.report.media import write_png
+from masiv.report.world_marks import ARROW, GRID, draw_world
 from masiv.scene.scene import Scene
 
 OUTLINE = (255, 60, 0)
 HIDDEN = (90, 90, 200)
 
 
+@dataclass(frozen=True)
+class Marks:
+    """What is drawn of the world: centre (3,) [m] of the object at frame 0; length [m] of the arrow upwards and of the
+    cells of the ground's grid."""
+
+    centre: np.ndarray
+    length: float
+
+
 def contact_sheet(
-    scene: Scene, columns: int = 6, tile: int = 160, notes: Mapping[int, str] | None = None
+    scene: Scene,
+    columns: int = 6,
+    tile: int = 160,
+    notes: Mapping[int, str] | None = None,
+    marks: Marks | None = None,
 ) -> np.ndarray:
     """(H, W, 3) uint8 RGB; ``columns`` frames spread over the scene, each picture ``tile`` pixels wide.
 
-    notes: what is written into the first picture of a view.
+    notes: what is written into the first picture of a view. marks: drawn into every picture.
     """
     frames = np.unique(np.linspace(0, scene.frame_count - 1, min(columns, scene.frame_count)).round().astype(int))
     if scene.load_cloud is not None:
-        return _clouds(scene, frames, tile)
-    rows = [np.concatenate([_tile(scene, view, int(frame), tile) for frame in frames], axis=1) for view in scene.views]
+        return _clouds(scene, frames, tile, marks)
+    rows = [
+        np.concatenate([_tile(scene, view, int(frame), tile, marks) for frame in frames], axis=1)
+        for view in scene.views
+    ]
     for row, view in zip(rows, scene.views, strict=True):
         if notes and view in notes:
             _write(row, notes[view], (3, row.shape[0] - 5))
+    if marks is not None:
+        _write(rows[0], f"up {marks.length:g} m", (tile - 70, 11))
     return np.concatenate(rows, axis=0)
 
 
-def _clouds(scene: Scene, frames: np.ndarray, tile: int) -> np.ndarray:
+def _clouds(scene: Scene, frames: np.ndarray, tile: int, marks: Marks | None) -> np.ndarray:
     """A row for each of two horizontal directions, ``up`` upwards; darker where there are more points."""
     clouds = [scene.cloud(int(frame)).points for frame in frames]
     seed = np.eye(3)[np.argmin(np.abs(scene.up))]
@@ -49,15 +70,32 @@ def _clouds(scene: Scene, frames: np.ndarray, tile: int) -> np.ndarray:
             grey = np.where(count > 0, 170 - 150 * np.minimum(count, 4) / 4, 245).astype(np.uint8)
             drawn = np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2))
             drawn[:, -1] = 200
+            if marks is not None:
+                _mark_cloud(drawn, scene, (centre, size), marks)
             cv2.putText(drawn, f"{row}:{frame}", (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.36, (0, 0, 0), 1, cv2.LINE_AA)
             tiles.append(drawn)
         rows.append(np.concatenate(tiles, axis=1))
     return np.concatenate(rows, axis=0)
 
 
-def write_contact_sheet(scene: Scene, path: Path, notes: Mapping[int, str] | None = None) -> None:
-    """Write ``contact_sheet(scene, notes=notes)`` as a PNG."""
-    write_png(path, contact_sheet(scene, notes=notes))
+def _mark_cloud(drawn: np.ndarray, scene: Scene, box: tuple[np.ndarray, float], marks: Marks) -> None:
+    """The ground's height as a line, if up is its normal, and a scale of ``marks.length`` upwards at the left side."""
+    centre, size = box
+    tile = len(drawn)
+    if scene.ground is not None and scene.ground.normal @ scene.up > 0.999:
+        row = round(tile * (0.5 - (scene.ground.height - centre @ scene.up) / size))
+        if 0 <= row < tile:
+            drawn[row] = GRID
+    long = round(tile * marks.length / size)
+    cv2.arrowedLine(drawn, (8, tile - 6), (8, tile - 6 - long), (0, 0, 0), 3, cv2.LINE_AA, 0, 0.2)
+    cv2.arrowedLine(drawn, (8, tile - 6), (8, tile - 6 - long), ARROW, 1, cv2.LINE_AA, 0, 0.2)
+
+
+def write_contact_sheet(
+    scene: Scene, path: Path, notes: Mapping[int, str] | None = None, marks: Marks | None = None
+) -> None:
+    """Write ``contact_sheet(scene, notes=notes, marks=marks)`` as a PNG."""
+    write_png(path, contact_sheet(scene, notes=notes, marks=marks))
 
 
 def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -68,13 +106,15 @@ def outlined(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return drawn
 
 
-def _tile(scene: Scene, view: int, frame: int, width: int) -> np.ndarray:
+def _tile(scene: Scene, view: int, frame: int, width: int, marks: Marks | None) -> np.ndarray:
     picture = scene.frame(view, frame)
     height = max(1, round(width * picture.image.shape[0] / picture.image.shape[1]))
     inter = cv2.INTER_AREA if picture.image.shape[1] > width else cv2.INTER_NEAREST
     image = cv2.resize(picture.image, (width, height), interpolation=inter)
     hidden = cv2.resize((~picture.valid).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     image[hidden] = (image[hidden] // 2 + np.array(HIDDEN, np.uint8) // 2).astype(np.uint8)
+    if marks is not None:
+        image = draw_world(image, scene.cameras[view], scene.up, scene.ground, marks.centre, marks.length)
     tile = outlined(image, cv2.resize(picture.mask, (width, height), interpolation=cv2.INTER_LINEAR))
     _write(tile, f"{view}:{frame}", (3, 11))
     return tile

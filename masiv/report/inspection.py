@@ -7,11 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from masiv.calibration.consistency import odd_camera, silhouette_consistency
+from masiv.calibration.clocks import clocks, late_cameras
+from masiv.calibration.consistency import consistency, odd_camera, pairs_of, tangency_series
+from masiv.calibration.frontier import Outlines
+from masiv.calibration.mask_flicker import flicker, flickering_masks, hole_share
+from masiv.calibration.outline_points import ray_centres
+from masiv.calibration.tangency import Outline, outline
 from masiv.hull.first_frame import first_frame_problems
 from masiv.hull.mask_quality import mask_quality
+from masiv.identifiability.answers import Identifiability, identifiability
+from masiv.identifiability.fall import fall_problem, wrong_scale
+from masiv.identifiability.from_scene import scene_motion
+from masiv.identifiability.from_tracks import track_motion
+from masiv.identifiability.motion import ObservedMotion
 from masiv.observations.identity import identity
-from masiv.report.contact_sheet import write_contact_sheet
+from masiv.report.contact_sheet import Marks, write_contact_sheet
+from masiv.report.world_marks import round_length
 from masiv.scene.scene import Scene
 from masiv.scene.summary import as_text, summarise
 from masiv.tracks.summary import summarise_tracks, tracks_as_text, write_tracks_picture
@@ -23,19 +34,94 @@ def inspection(read: Scene | Tracks, picture: Path) -> tuple[dict[str, Any], str
     if isinstance(read, Tracks):
         write_tracks_picture(read, picture)
         summary = {**summarise_tracks(read), "picture": str(picture)}
-        return summary, tracks_as_text(summary)
-    agreement = silhouette_consistency(read)
+        motions = [found for run in read.runs if (found := track_motion(read, run)) is not None]
+        for motion in motions:
+            summary["problems"] += _fall_problems(motion, motion.times, motion.centre, f"run {motion.name}: ")
+        return _with_answers(summary, motions, tracks_as_text)
     summary = {**summarise(read), **identity(read), "picture": str(picture)}
-    for view, error in zip(agreement.views, agreement.pixels, strict=True):
-        summary["cameras"][view]["consistency_px"] = float(error) if np.isfinite(error) else None
-    quality = mask_quality(read)
-    for view, agrees, doubt in zip(quality.views, quality.agreement, quality.doubt, strict=True):
-        summary["cameras"][view]["mask_agreement"] = float(agrees) if np.isfinite(agrees) else None
-        summary["cameras"][view]["mask_doubt"] = float(doubt) if np.isfinite(doubt) else None
-    summary["problems"] += [*first_frame_problems(read), *quality.problems()]
-    odd = odd_camera(read, agreement)
-    summary["problems"] += [] if odd is None else [odd]
-    write_contact_sheet(
-        read, picture, {v: f"{e:.1f} px" for v, e in zip(agreement.views, agreement.pixels, strict=True)}
-    )
-    return summary, as_text(summary)
+    path, notes = None, {}
+    if read.cameras:
+        path, notes = _inspect_cameras(read, summary)
+    first = first_frame_problems(read)
+    summary["problems"] += first
+    motion = scene_motion(read)
+    if motion is not None:
+        times, centre = (motion.times, motion.centre) if path is None else path
+        summary["problems"] += _fall_problems(motion, times, centre)
+    marks = None if motion is None else Marks(motion.centre[0], round_length(0.5 * motion.size))
+    write_contact_sheet(read, picture, notes, marks)
+    return _with_answers(summary, [] if motion is None else [motion], as_text)
+
+
+def _with_answers(summary: dict[str, Any], motions: list[ObservedMotion], text) -> tuple[dict[str, Any], str]:
+    found = [identifiability(motion) for motion in motions]
+    summary["identifiability"] = [one.summary() for one in found]
+    lines = text(summary).splitlines()
+    return summary, "\n".join([*lines[:-1], *_answer_lines(found), lines[-1]])  # the last is the picture
+
+
+def _answer_lines(found: list[Identifiability]) -> list[str]:
+    lines = []
+    for one in found:
+        lines += [f"what the motion of {one.recording} tells (estimates)", *one.lines()]
+    return lines
+
+
+def _fall_problems(motion: ObservedMotion, times: np.ndarray, centre: np.ndarray, who: str = "") -> list[str]:
+    """centre (T, 3) [m] at ``times`` (T,) [s], which may be more than those of ``motion``."""
+    if motion.clamped:
+        return []
+    wrong = fall_problem(times, centre, motion.gravity)
+    if wrong is None and motion.lowest is not None and motion.contact is not None:
+        flies = times < motion.times[motion.contact]
+        wrong = wrong_scale(times[flies], centre[flies], motion.gravity)
+    return [] if wrong is None else [who + wrong]
+
+
+def _inspect_cameras(scene: Scene, summary: dict[str, Any]) -> tuple[tuple[np.ndarray, np.ndarray], dict[int, str]]:
+    """Numbers and problems of cameras and masks into ``summary``; times (T,) [s] and path (T, 3) [m] of the object, and
+    a note for each view."""
+    cameras = [scene.cameras[view] for view in scene.views]
+    outlines, holes = _outlines(scene)
+    series = tangency_series(cameras, outlines)
+    agreement = consistency(scene.views, pairs_of(series))
+    quality = mask_quality(scene)
+    # Masks that were made to agree with each other agree at a wrong time, too.
+    raw = outlines if scene.correct_masks is None else [
+        [outline(scene.load(view, frame)) for frame in range(scene.frame_count)] for view in scene.views
+    ]  # fmt: skip
+    found, flickers = clocks(scene.views, cameras, raw, scene.fps), flicker(scene.views, series, holes)
+    rows = summary["cameras"]
+    for k, view in enumerate(scene.views):
+        rows[view]["consistency_px"] = _plain(agreement.pixels[k])
+        rows[view]["mask_agreement"] = _plain(quality.agreement[k])
+        rows[view]["mask_doubt"] = _plain(quality.doubt[k])
+        rows[view]["time_offset_ms"] = None if found is None else 1e3 * float(found.offsets[k])
+        rows[view]["time_offset_error_ms"] = None if found is None else 1e3 * float(found.standard_errors[k])
+        rows[view]["flickering_frames"] = list(flickers.frames[k])
+    late = {} if found is None else late_cameras(scene, found)
+    odd = None if agreement.suspect in late else odd_camera(scene, agreement)
+    summary["problems"] += [*late.values(), *([] if odd is None else [odd])]
+    summary["problems"] += [*flickering_masks(scene, flickers), *quality.problems()]
+    frames, centres = ray_centres(cameras, Outlines.of(outlines, range(scene.frame_count)))
+    notes = {view: f"{error:.1f} px" for view, error in zip(agreement.views, agreement.pixels, strict=True)}
+    return (frames / scene.fps, centres), notes
+
+
+def _outlines(scene: Scene) -> tuple[list[list[Outline | None]], np.ndarray]:
+    """Outlines, a list for each view, and ``hole_share`` (V, F) of each mask."""
+    outlines, holes = [], np.full((len(scene.views), scene.frame_count), np.nan)
+    for row, view in enumerate(scene.views):
+        outlines.append([])
+        masks: list[np.ndarray] = []
+        for frame in range(scene.frame_count):
+            picture = scene.frame(view, frame)
+            outlines[-1].append(outline(picture))
+            masks = [*masks[-2:], picture.mask]
+            if len(masks) == 3:
+                holes[row, frame - 1] = hole_share(*masks)
+    return outlines, holes
+
+
+def _plain(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -45,7 +45,8 @@ def _shutters(scene: Scene) -> dict[str, Any]:
 def summarise(scene: Scene) -> dict[str, Any]:
     """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem.
 
-    ``consistency_px``, ``mask_agreement`` and ``mask_doubt`` of the cameras are not known here.
+    What compares the cameras is not known here: ``consistency_px``, ``mask_agreement``, ``mask_doubt``, the time offsets
+    and the frames that flicker.
     """
     if scene.load_cloud is not None:
         return _summarise_clouds(scene)
@@ -87,6 +88,9 @@ def summarise(scene: Scene) -> dict[str, Any]:
                 "consistency_px": None,
                 "mask_agreement": None,
                 "mask_doubt": None,
+                "time_offset_ms": None,
+                "time_offset_error_ms": None,
+                "flickering_frames": [],
             }
             for view, camera in enumerate(scene.cameras)
         ],
@@ -169,4 +173,9 @@ def _agreement(cameras: list[dict[str, Any]]) -> list[str]:
     for key, form, title in measures:
         known = [f"{k}: {camera[key]:{form}}" for k, camera in enumerate(cameras) if camera[key] is not None]
         lines += [f"{title}  {', '.join(known)}"] if known else []
-    return lines
+    offsets = [
+        f"{k}: {camera['time_offset_ms']:.1f} ± {camera['time_offset_error_ms']:.1f}"
+        for k, camera in enumerate(cameras)
+        if camera["time_offset_ms"] is not None
+    ]
+    return lines + ([f"clocks against the median camera [ms]  {', '.join(offsets)}"] if offsets else [])

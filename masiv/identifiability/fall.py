@@ -1,0 +1,66 @@
+"""Whether a body that falls does so along the declared gravity: a wrong up axis, frame rate or unit shows here."""
+
+from __future__ import annotations
+
+import numpy as np
+
+FEWEST_FRAMES = 5
+MAX_ANGLE_DEG = 30.0
+"""Between fall and gravity. Chosen: a wrong axis has 90°, a wind of half of gravity 27°."""
+MAX_FACTOR = 1.5
+"""Between fall and gravity. Chosen: a frame rate that is wrong by a factor of 1.25 makes 1.56."""
+STANDARD_ERRORS = 5.0
+
+
+def acceleration(times: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, float]:
+    """Acceleration (3,) [m/s²] of ``path`` (T, 3) [m] by least squares, and its standard error in one axis."""
+    t = times - times.mean()
+    basis = np.stack([np.ones_like(t), t, 0.5 * t**2], axis=1)
+    found, *_ = np.linalg.lstsq(basis, path, rcond=None)
+    left = path - basis @ found
+    variance = float((left**2).sum()) / (3 * (len(t) - 3))
+    return found[2], float(np.sqrt(variance * np.linalg.inv(basis.T @ basis)[2, 2]))
+
+
+def fall_problem(times: np.ndarray, path: np.ndarray, gravity: np.ndarray) -> str | None:
+    """A sentence if the body flies at the beginning of ``path`` (T, 3) [m] and not along ``gravity`` (3,) [m/s²].
+
+    It flies over the first frames whose acceleration is constant: the most of ``FEWEST_FRAMES`` or more in which twice
+    the frames do not say otherwise, by the standard error.
+    """
+    strength = float(np.linalg.norm(gravity))
+    if strength == 0 or len(times) < FEWEST_FRAMES:
+        return None
+    found = [acceleration(times[:n], path[:n]) for n in range(FEWEST_FRAMES, len(times) + 1)]
+    fall, error = min(found, key=lambda pair: pair[1])
+    size = float(np.linalg.norm(fall))
+    if size < STANDARD_ERRORS * error or size == 0:
+        return None  # it rests, is held, or is not seen well enough
+    angle = float(np.degrees(np.arccos(np.clip(fall @ gravity / (size * strength), -1, 1))))
+    way = ", ".join(f"{x:.1f}" for x in fall)
+    declared = ", ".join(f"{x:.1f}" for x in gravity)
+    slack = STANDARD_ERRORS * error / strength
+    if angle > MAX_ANGLE_DEG and abs(size / strength - 1) < 0.25 + slack:
+        return (
+            f"the object falls by ({way}) ± {error:.1f} m/s², and gravity is ({declared}): correct up_axis or gravity "
+            "in scene.yaml"
+        )
+    return None
+
+
+def wrong_scale(times: np.ndarray, path: np.ndarray, gravity: np.ndarray) -> str | None:
+    """A sentence if ``path`` (T, 3) [m], all of it in flight, is along ``gravity`` but much faster or slower."""
+    strength = float(np.linalg.norm(gravity))
+    if strength == 0 or len(times) < FEWEST_FRAMES:
+        return None
+    fall, error = acceleration(times, path)
+    along = float(fall @ gravity) / strength
+    across = float(np.linalg.norm(fall - along * gravity / strength))
+    low, high = along - STANDARD_ERRORS * error, along + STANDARD_ERRORS * error
+    if across > 0.5 * abs(along) or (1 / MAX_FACTOR * strength < high and low < MAX_FACTOR * strength):
+        return None
+    return (
+        f"in flight the object accelerates by {along:.3g} ± {error:.2g} m/s² along gravity, which is {strength:.3g}: "
+        f"check fps (a factor of {np.sqrt(abs(strength / along)):.3g} would explain it), the unit of the poses, or gravity "
+        "in scene.yaml"
+    )
