@@ -1,6 +1,6 @@
 """Make the clips of the effects gallery: the same soft cube, simulated without (left) and with (right) each effect.
 
-    python docs/gallery.py [EFFECT …]          (a minute or two for all; clips are written to docs/gallery)
+python docs/gallery.py [EFFECT …]          (a minute or two for all; clips are written to docs/gallery)
 """
 
 import sys

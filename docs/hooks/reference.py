@@ -67,7 +67,8 @@ def _parameters(effect) -> str:
     shown = effect.parameters if len(effect.parameters) < 12 else (effect.parameters[0], effect.parameters[-1])
     for parameter in shown:
         role = "strength" if parameter in effect.parameters[: effect.strengths] else ""
-        rows.append(f"| `{parameter.name}` | {parameter.unit} | {parameter.lower:g} to {parameter.upper:g} | {role} |")
+        unit = parameter.unit.replace("^2", "²")
+        rows.append(f"| `{parameter.name}` | {unit} | {parameter.lower:g} to {parameter.upper:g} | {role} |")
     if len(shown) < len(effect.parameters):
         rows.insert(3, f"| … {len(effect.parameters) - 2} more | | | |")
     return "\n".join(rows)

@@ -54,6 +54,9 @@ def uri_of(path: Path) -> str | None:
     """Where a file of the repository is in the site; None if it is not."""
     if path in PAGES:
         return PAGES[path]
-    if path.is_relative_to(DOCS) and path.suffix not in ("", ".py"):  # it need not exist: some pages are made of the code
+    if path.is_relative_to(DOCS) and path.suffix not in (
+        "",
+        ".py",
+    ):  # it need not exist: some pages are made of the code
         return path.relative_to(DOCS).as_posix()
     return None
