@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import html
+import http.server
 import os
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from browser import watched
 
 import masiv
 from masiv.cli.main import app
@@ -118,3 +122,46 @@ def test_every_public_name_is_in_the_reference(site, pages):
 def test_every_page_of_the_repository_is_in_the_site(site):
     for page in (ROOT / "docs").rglob("*.md"):
         assert (site / page.relative_to(ROOT / "docs").with_suffix(".html")).is_file(), page
+
+
+@pytest.fixture(scope="module")
+def address(site):
+    """Of the site on a server of this machine: a browser does not let a page from a disk search."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *arguments: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(site))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.mark.parametrize("width", [1400, 400])
+@pytest.mark.parametrize("name", ["index", "effects", "theory/discovery", "api"])
+def test_a_browser_shows_the_page(browser, address, name, width):
+    with watched(browser, width=width) as seen:
+        seen.page.goto(f"{address}/{name}.html")
+        seen.page.wait_for_load_state("load")
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+        broken = "[...document.images].filter(i => i.complete && !i.naturalWidth).map(i => i.src)"
+        assert seen.page.evaluate(broken) == []
+        heights = seen.page.evaluate(
+            "[...document.querySelectorAll('math')].map(m => m.getBoundingClientRect().height)"
+        )
+        assert all(height > 5 for height in heights)
+        assert len(heights) > (20 if name in ("effects", "theory/discovery") else -1)
+        assert (seen.errors, seen.requests) == ([], [])
+
+
+def test_the_search_finds_an_effect(browser, address):
+    with watched(browser) as seen:
+        seen.page.goto(f"{address}/index.html")
+        seen.page.locator("[data-md-component=search-query]").fill("hidden_obstacle")
+        seen.page.locator(".md-search-result__link").first.wait_for(timeout=30_000)
+        found = seen.page.locator(".md-search-result__link")
+        assert any(
+            re.search(r"effects\.html.*#hidden_obstacle$", link.get_attribute("href") or "") for link in found.all()
+        )
+        assert (seen.errors, seen.requests) == ([], [])
