@@ -10,7 +10,7 @@ BIN = $(VENV)/bin
 INSTALLED = $(VENV)/installed
 RUN = runs/demo
 
-.PHONY: demo test test-all lint wheel-test bench clean install
+.PHONY: demo test test-all lint wheel-test docs gallery bench clean install
 
 install: $(INSTALLED)
 
@@ -33,7 +33,7 @@ test: lint
 	$(PYTEST) -m "not slow"
 
 # Exit code 5 of pytest: no test is marked.
-test-all: wheel-test
+test-all: wheel-test docs
 	$(PYTEST) -m slow || test $$? -eq 5
 
 lint: $(INSTALLED)
@@ -44,6 +44,15 @@ lint: $(INSTALLED)
 
 wheel-test: $(INSTALLED)
 	$(BIN)/python tests/wheel/check.py $(if $(TORCH_INDEX),--torch-index $(TORCH_INDEX))
+
+# A page that is missing, a link or an anchor that leads nowhere, a formula that cannot be drawn are errors.
+docs: $(INSTALLED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "open build/site/index.html, or with search: $(PYTHON) -m http.server -d build/site"
+
+# The clips of the effects, which are kept in docs/gallery.
+gallery: $(INSTALLED)
+	$(BIN)/python docs/gallery.py
 
 # Those that need no scene, run or measurement; refine_tracks, which needs none either, is one case after the other.
 BENCHMARKS = dam_break dissipation hidden_in_law mpm_speed transfer

@@ -3,14 +3,15 @@
 Every function starts Taichi on ``config.arch`` if it is not running yet. SI units, world frame.
 
 Example:
-    scene = masiv.read_scene("assets/sample")
-    config = masiv.load_config("quick")
-    gaussians = masiv.reconstruct(scene, config)
-    scene = masiv.calibrated(scene, gaussians)
-    trajectory = masiv.estimate_trajectory(scene, gaussians, config)
-    twin = masiv.identify(scene, trajectory, config)
-    result, twin = masiv.refine(scene, twin, trajectory, config)
-    rollout = masiv.simulate(twin, frames=40, gravity=(0, -1.62, 0))
+
+        scene = masiv.read_scene("assets/sample")
+        config = masiv.load_config("quick")
+        gaussians = masiv.reconstruct(scene, config)
+        scene = masiv.calibrated(scene, gaussians)
+        trajectory = masiv.estimate_trajectory(scene, gaussians, config)
+        twin = masiv.identify(scene, trajectory, config)
+        result, twin = masiv.refine(scene, twin, trajectory, config)
+        rollout = masiv.simulate(twin, frames=40, gravity=(0, -1.62, 0))
 """
 
 from __future__ import annotations

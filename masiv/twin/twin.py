@@ -173,16 +173,16 @@ class Twin:
 
     # -- files ----------------------------------------------------------------------------------------------------
 
-    def save(self, folder: Path, name: str = TWIN_FILE) -> None:
+    def save(self, folder: str | Path, name: str = TWIN_FILE) -> None:
         """Write ``name``, laws and particles, each file complete or not at all. Those of twin.before.yaml have
         ``.before`` in their names, too."""
-        write_document(vars(self), folder, name)
+        write_document(vars(self), Path(folder), name)
 
     @classmethod
-    def load(cls, folder: Path, name: str = TWIN_FILE, *, scene: Callable[[], Twin] | None = None) -> Twin:
+    def load(cls, folder: str | Path, name: str = TWIN_FILE, *, scene: Callable[[], Twin] | None = None) -> Twin:
         """Read what ``save`` wrote, of schema 1 too. scene: gives the twin without effects that the scene of a run of
         tracks describes (``masiv.twin.from_tracks``), since files of schema 1 do not hold its bodies.
 
         Raises InputError, with the key, if the file is missing or holds something else.
         """
-        return cls(**read_document(folder, name, None if scene is None else lambda: vars(scene())))
+        return cls(**read_document(Path(folder), name, None if scene is None else lambda: vars(scene())))
