@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import html
 import http.server
+import importlib.util
 import os
 import re
 import subprocess
@@ -98,10 +99,23 @@ def test_formulas_are_drawn(pages):
         assert not left, f"{page.name}: {left[:3]}"
 
 
+def test_a_formula_that_cannot_be_drawn_is_an_error():
+    from mkdocs.exceptions import PluginError
+
+    specification = importlib.util.spec_from_file_location("mathml", ROOT / "docs/hooks/mathml.py")
+    assert specification is not None
+    assert specification.loader is not None
+    hook = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(hook)
+    assert "<mfrac>" in hook.mathml(r"\frac{a &lt; b}{c}", True, "page.md")
+    with pytest.raises(PluginError, match=r"page.md.*nosuchcommand"):
+        hook.mathml(r"a \nosuchcommand b", False, "page.md")
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_its_page(site, name):
     text = (site / f"commands/{name}.html").read_text(encoding="utf-8")
-    assert "--set" in text
+    assert "--help" in text
     assert f"masiv {name}" in text
 
 
