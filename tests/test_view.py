@@ -167,9 +167,9 @@ def test_colours_say_the_stress(twin):
     np.testing.assert_array_equal(shown.colours(PLAIN, 0, 1.0)[7], SIMULATED)
     assert field_range(np.zeros((2, 3))) == 1.0
     assert 97 <= shown.top(STRESS) <= 98
-    text = legend("stress <1>", "Pa", 200.0, 321.0)
-    assert "stress &lt;1&gt; [Pa]; highest 321" in text
-    assert re.findall(r"<span>([^<]*)</span>", text) == ["0", "50", "100", "150", "200"]
+    text = legend("stress <1>", "Pa", 20000.0, 321456.0)
+    assert "stress &lt;1&gt; [Pa]; highest 321,000" in text
+    assert re.findall(r"<span>([^<]*)</span>", text) == ["0", "5,000", "10,000", "15,000", "20,000"]
     assert len(coloured(np.array([np.nan, 1.0]), 2.0)) == 2
 
 

@@ -29,10 +29,15 @@ def legend(name: str, unit: str, top: float, highest: float) -> str:
     from matplotlib import colormaps
 
     stops = ", ".join("rgb({},{},{})".format(*colormaps[MAP](k / 10, bytes=True)[:3]) for k in range(11))
-    marks = "".join(f"<span>{k * top / 4:.3g}</span>" for k in range(5))
+    marks = "".join(f"<span>{_digits(k * top / 4)}</span>" for k in range(5))
     return (
         '<div style="padding:0 0.75em 0.5em;font-size:0.8em">'
-        f"<div>{html.escape(name)} [{html.escape(unit)}]; highest {highest:.3g}</div>"
+        f"<div>{html.escape(name)} [{html.escape(unit)}]; highest {_digits(highest)}</div>"
         f'<div style="height:0.9em;background:linear-gradient(to right, {stops})"></div>'
         f'<div style="display:flex;justify-content:space-between">{marks}</div></div>'
     )
+
+
+def _digits(value: float) -> str:
+    """``value`` with three digits, without an exponent unless it is very small or large."""
+    return f"{float(f'{value:.3g}'):,.10g}"
