@@ -249,6 +249,7 @@ def checkbox(page, label):
     return row.locator("xpath=ancestor::div[.//input[@type='checkbox']][1]").locator("input")
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_motion_and_simulates_it_again(taichi, run, twin, browser):
     subject = reopen_run(run).subject(ViewRequest(frames=FRAMES))
     with open_page(subject, port=8720) as page, watched(browser) as seen:
@@ -327,9 +328,9 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(run):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["--frames", "1"], "--frames 1: give 2 to"),
         (["--host", "192.0.2.1"], "--host 192.0.2.1"),
-        (["--law", "nowhere"], "--law nowhere is not a run folder"),
+        pytest.param(["--frames", "1"], "--frames 1: give 2 to", marks=pytest.mark.slow),
+        pytest.param(["--law", "nowhere"], "--law nowhere is not a run folder", marks=pytest.mark.slow),
     ],
 )
 def test_what_cannot_be_shown_is_refused(run, given, message):
