@@ -16,6 +16,7 @@ from .options import (
     PresetOption,
     RunArgument,
     SeedOption,
+    SetOption,
     overrides,
 )
 
@@ -39,6 +40,7 @@ def view(
     ] = 8080,
     scene: MovedSceneOption = None,
     config: ConfigOption = None,
+    assignments: SetOption = None,
     preset: PresetOption = None,
     arch: ArchOption = None,
     seed: SeedOption = None,
@@ -52,6 +54,6 @@ def view(
     from masiv.pipeline import ViewRequest, reopen_run
 
     request = ViewRequest(frames=frames, law=law, condition=condition, host=host, port=port)
-    opened = reopen_run(run, overrides(preset, config, seed, arch), scene=scene)
+    opened = reopen_run(run, overrides(preset, config, seed, arch, assignments), scene=scene)
     opened.view(request, lambda ready: announce(ready.data, ready.text, as_json))
     return {}, ""
