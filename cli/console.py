@@ -71,6 +71,19 @@ def fail(message: str, code: int, as_json: bool) -> NoReturn:
     raise typer.Exit(code)
 
 
+_stdout: list[int] = []
+"""The descriptor of stdout while ``_quiet_stdout`` keeps it from libraries."""
+
+
+def announce(data: dict[str, Any], text: str, as_json: bool) -> None:
+    """Print the result of a command that goes on: ``data`` with --json, else ``text``."""
+    if as_json:
+        with os.fdopen(os.dup(_stdout[-1] if _stdout else 1), "w") as stdout:
+            print(json.dumps(data), file=stdout)
+    else:
+        print(text, flush=True)
+
+
 @contextmanager
 def _quiet_stdout(quiet: bool) -> Iterator[None]:
     """Send what libraries print on stdout to stderr, so that stdout holds the one JSON object alone."""
@@ -80,10 +93,12 @@ def _quiet_stdout(quiet: bool) -> Iterator[None]:
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)
+    _stdout.append(kept)
     try:
         with redirect_stdout(sys.stderr):  # what Python prints; the descriptor is for compiled code
             yield
     finally:
+        _stdout.pop()
         os.dup2(kept, 1)
         os.close(kept)
 

@@ -20,6 +20,7 @@ from .refine import refine
 from .simulate import simulate
 from .synth import synth
 from .trajectory import trajectory
+from .view import view
 
 app = typer.Typer(
     name="masiv",
@@ -29,7 +30,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-for function in (identify, inspect, reconstruct, trajectory, refine, simulate, evaluate, pretrain, synth, config):
+for function in (identify, inspect, reconstruct, trajectory, refine, simulate, evaluate, view, pretrain, synth, config):
     app.command()(console.command(function))
 
 

@@ -17,6 +17,11 @@ from masiv.errors import InputError
 _started: str | None = None
 
 
+def silence() -> None:
+    """Keep Taichi from printing a line when it is imported: for what uses its definitions without starting it."""
+    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
+
+
 def start(arch: str = "cpu") -> Any:
     """Start Taichi on ``arch`` (cpu, cuda or vulkan), once a process, and return the ``taichi`` module.
 
@@ -24,7 +29,7 @@ def start(arch: str = "cpu") -> Any:
     Raises InputError for an unknown arch, for one that this machine lacks, and for a change of arch.
     """
     global _started
-    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
+    silence()
     import taichi as ti
 
     if _started == arch:

@@ -136,9 +136,9 @@ class Workers:
             others = set(multiprocessing.active_children())
             spawn = multiprocessing.get_context("spawn")  # Taichi's threads do not survive a fork
             arguments = (runtime.running_arch(), os.getpid())
-            self._pool = ProcessPoolExecutor(self.processes, spawn, _initialize, arguments)
+            self._pool = ProcessPoolExecutor(self.processes, spawn, initialize_process, arguments)
             try:
-                with _interrupts_not_inherited():
+                with interrupts_not_inherited():
                     for _ in range(self.processes):  # a pool starts a process for each task that no idle one can take
                         self._pool.submit(_do_nothing)
             finally:  # an interruption, too, has to find those that have started
@@ -147,7 +147,7 @@ class Workers:
 
 
 @contextmanager
-def _interrupts_not_inherited() -> Iterator[None]:
+def interrupts_not_inherited() -> Iterator[None]:
     """Processes that start in this block never get SIGINT, which a terminal sends to all; not even while they import.
     This process gets it when the block ends."""
     if not hasattr(signal, "pthread_sigmask"):
@@ -162,7 +162,7 @@ def _interrupts_not_inherited() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _initialize(arch: str, parent: int) -> None:
+def initialize_process(arch: str, parent: int) -> None:
     """Let a new process end with the process ``parent``, limit it to one thread and start Taichi.
 
     The variables act on libraries that the caller's script has not imported yet, the calls on torch and Taichi.

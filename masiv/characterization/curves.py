@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from masiv.materials.law import Law
+from masiv.materials.measures import deviatoric_strain
 
 DIFFERENCE_STRAIN = 1e-5
 """Strain [1] of the finite differences at rest."""
@@ -136,15 +137,6 @@ def _free_sides(law: Law, state: torch.Tensor, step: float, dt: float) -> tuple[
             value_a /= 2
         b, value_b = middle, best[0]
     return best[1], best[2]
-
-
-def deviatoric_strain(gradients: torch.Tensor) -> torch.Tensor:
-    """Equivalent deviatoric Hencky strain sqrt(2/3) |dev ln V| (...,) of gradients (..., 3, 3).
-
-    In a stretch at constant volume it is the axial strain.
-    """
-    log = torch.log(torch.linalg.svdvals(gradients.double()))
-    return (2 / 3) ** 0.5 * (log - log.mean(-1, keepdim=True)).norm(dim=-1)
 
 
 def kept_shear(law: Law, shear: float, log_volume: float, hold: float) -> float:

@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from masiv.characterization.curves import deviatoric_strain, moduli_at_rest
+from masiv.characterization.curves import moduli_at_rest
 from masiv.errors import InputError, NonFiniteError
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.law import Law
+from masiv.materials.measures import deviatoric_strain
 from masiv.materials.neural import NeuralLaw, output_layer
 
 if TYPE_CHECKING:

@@ -333,6 +333,15 @@ class MpmKernels(GridKernels):
                     trial[p, a, b] = self.trial_gradient[s, p][a, b]
 
     @ti.kernel
+    def read_stress(self, s: ti.i32, gradient: ti.types.ndarray(), kirchhoff: ti.types.ndarray()):
+        """Elastic deformation gradient and Kirchhoff stress in substep s."""
+        for p in range(gradient.shape[0]):
+            for a in ti.static(range(3)):
+                for b in ti.static(range(3)):
+                    gradient[p, a, b] = self.deformation_gradient[s, p][a, b]
+                    kirchhoff[p, a, b] = self.kirchhoff_stress[s, p][a, b]
+
+    @ti.kernel
     def write_mass(self, mass: ti.types.ndarray()):
         for p in range(mass.shape[0]):
             self.particle_mass[p] = mass[p]

@@ -108,6 +108,23 @@ class DeformableBody:
             demand=NO_DEMAND if effects is None else effects.substep_demand(),
         )
 
+    def simulator(self, substep: float, contact: str, dtype: torch.dtype) -> Simulator:
+        """That of the body, with substeps of ``substep`` [s]. contact: with the ground, see ``Simulator``."""
+        return Simulator(
+            particle_count=self.count,
+            spacing=self.spacing,
+            substep=substep,
+            volume=self.volume,
+            density=self.density,
+            gravity=self.gravity,
+            contact=contact,
+            dtype=dtype,
+            memory_mb=self.config.memory_mb,
+            max_substeps=self.max_substeps,
+            grid_nodes=self.config.grid_nodes,
+            chunks=self.config.chunks,
+        )
+
     def rollout(
         self,
         law: Law,
@@ -129,20 +146,7 @@ class DeformableBody:
         ):  # fmt: skip
             if tuple(tensor.shape) != shape:
                 raise ValueError(f"the state's {name} has shape {tuple(tensor.shape)}, it must be {shape}")
-        simulator = Simulator(
-            particle_count=self.count,
-            spacing=self.spacing,
-            substep=substep,
-            volume=self.volume,
-            density=self.density,
-            gravity=self.gravity,
-            contact=contact,
-            dtype=state.position.dtype,
-            memory_mb=self.config.memory_mb,
-            max_substeps=self.max_substeps,
-            grid_nodes=self.config.grid_nodes,
-            chunks=self.config.chunks,
-        )
+        simulator = self.simulator(substep, contact, state.position.dtype)
         wanted = sorted(set(outputs))
         positions = rollout(simulator, law, state, wanted[-1], wanted, effects)
         if len(wanted) == len(outputs):

@@ -114,6 +114,13 @@ class TapedRollout:
         self.kernels.read_state(s, *out.tensors())
         return out
 
+    def read_stress(self, s: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Elastic deformation gradient and Kirchhoff stress [Pa], (N, 3, 3), in local substep s of the segment that is
+        in the fields: after the law and the effects on the stress."""
+        gradient, kirchhoff = (torch.empty(self.count, 3, 3, dtype=self.dtype) for _ in range(2))
+        self.kernels.read_stress(s, gradient, kirchhoff)
+        return gradient, kirchhoff
+
     def _write_constants(self) -> None:
         self.constants.write(self.kernels, self.mass.detach())
         self.effects.write()

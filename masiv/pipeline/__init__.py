@@ -1,6 +1,6 @@
 """What the commands do, as functions: open a run folder, run the stages that it lacks, write its artefacts."""
 
-from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary
+from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, ViewRequest
 from masiv.pipeline.run import Run, inspect_scene, open_run, reopen_run
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "SceneRequest",
     "SimulateRequest",
     "Summary",
+    "ViewRequest",
     "inspect_scene",
     "open_run",
     "reopen_run",

@@ -87,6 +87,18 @@ class SimulateRequest:
 
 
 @dataclass(frozen=True)
+class ViewRequest:
+    """What ``view`` shows, and where. frames: that are simulated (None: those that were observed). law: another run,
+    whose law can be taken. condition: of the runs. host, port: of the page."""
+
+    frames: int | None = None
+    law: Path | None = None
+    condition: str | None = None
+    host: str = "127.0.0.1"
+    port: int = 8080
+
+
+@dataclass(frozen=True)
 class RefineRequest:
     """What ``refine`` looks at. second_run: another recording of the same object, fitted jointly. group: bodies in
     flight that share physics. condition: of the runs. dry_run: rank the effects, change nothing. relearn: learn the

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from masiv import runtime
 from masiv.config import Config, load_config
 from masiv.errors import InputError
-from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary
+from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, ViewRequest
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder
+
+if TYPE_CHECKING:
+    from masiv.view.subject import Subject
 
 
 class Run(ABC):
@@ -86,6 +89,18 @@ class Run(ABC):
     @abstractmethod
     def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
         """Errors against ground truth or against held-out observations: evaluate.json."""
+
+    @abstractmethod
+    def subject(self, request: ViewRequest) -> Subject:
+        """What can be shown of the run. Raises InputError."""
+
+    def view(self, request: ViewRequest, ready: Callable[[Summary], None]) -> None:
+        """Serve a page that shows the run, until an exception such as Ctrl-C; ``ready`` is told its address. Only
+        reads. Raises InputError."""
+        runtime.silence()  # Taichi runs in the process that simulates
+        from masiv.pipeline.view import view
+
+        view(self, request, ready)
 
 
 def _kinds() -> dict[str, type[Run]]:

@@ -11,7 +11,15 @@ from masiv.config import Config, given_settings
 from masiv.errors import InputError
 from masiv.files import write_json, write_npz
 from masiv.observations.identity import identity
-from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
+from masiv.pipeline.requests import (
+    Overrides,
+    RefineRequest,
+    SceneRequest,
+    SimulateRequest,
+    Summary,
+    ViewRequest,
+    refuse,
+)
 from masiv.pipeline.run import Run, settings
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder, refuse_run
@@ -23,6 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from masiv.twin import Twin
+    from masiv.view.subject import Subject
 
 NOT_FOR_TRACKS = (
     *("omega", "law", "blend", "geometry", "density", "ground"),
@@ -92,7 +101,7 @@ class TracksRun(Run):
 
         families: list[dict[str, Any]] = []
         if self.folder.done("identify"):
-            twin = self._load_twin()
+            twin = self.load_twin()
         else:
             with self.folder.stage("identify"):
                 twin, fits = identify_tracks(
@@ -162,7 +171,7 @@ class TracksRun(Run):
         self.start()
         from masiv.simulation.simulate import simulate
 
-        twin = self._load_twin()
+        twin = self.load_twin()
         rollout = simulate(
             twin, frames=request.frames, velocity=request.velocity, gravity=request.gravity, without=request.without,
             condition=request.condition, progress=progress,
@@ -178,6 +187,11 @@ class TracksRun(Run):
         }
         return Summary(data, str(path))
 
+    def subject(self, request: ViewRequest) -> Subject:
+        from masiv.pipeline.view import tracks_subject
+
+        return tracks_subject(self, request)
+
     def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
         """Errors of every run, fitted and held out apart, before and after refine: evaluate.json."""
         if truth is not None:
@@ -185,7 +199,7 @@ class TracksRun(Run):
         self.folder.require("identify")
         self.start()
         with self.changing():
-            rows = self._report(self._load_twin(), progress)
+            rows = self._report(self.load_twin(), progress)
             numbers = {
                 "fit": [r for r in rows if r["use"] == "fit"],
                 "held_out": [r for r in rows if r["use"] == "hold_out"],
@@ -205,7 +219,8 @@ class TracksRun(Run):
     def _conditions(self) -> list[str]:
         return list(dict.fromkeys(run.condition for run in self.tracks.runs))
 
-    def _load_twin(self) -> Twin:
+    def load_twin(self) -> Twin:
+        """The run's twin; of a file of schema 1, with the bodies of the scene. Raises InputError."""
         from masiv.twin import Twin
 
         return Twin.load(self.path, scene=self._described_twin)

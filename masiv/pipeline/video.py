@@ -15,7 +15,15 @@ from masiv.observations.identity import identity
 from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
 from masiv.pipeline import stages
-from masiv.pipeline.requests import Overrides, RefineRequest, SceneRequest, SimulateRequest, Summary, refuse
+from masiv.pipeline.requests import (
+    Overrides,
+    RefineRequest,
+    SceneRequest,
+    SimulateRequest,
+    Summary,
+    ViewRequest,
+    refuse,
+)
 from masiv.pipeline.run import Run, reopen_run, settings
 from masiv.progress import Progress, silent
 from masiv.runfolder import Request, RunFolder, refuse_run
@@ -25,6 +33,7 @@ from masiv.scene.scene import Scene
 
 if TYPE_CHECKING:
     from masiv.report.viewpoints import View
+    from masiv.view.subject import Subject
 
 MIN_SLOW, MAX_SLOW = 0.01, 100.0
 """How many times slower than the motion a video may run: one of a second lasts 10 ms to 100 s."""
@@ -245,6 +254,11 @@ class VideoRun(Run):
         """The scene's cameras, as refined; the scene itself is read only if they were kept as given."""
         calibration = Calibration.load(self.path)
         return self.scene.cameras if calibration is None else calibration.refined
+
+    def subject(self, request: ViewRequest) -> Subject:
+        from masiv.pipeline.view import video_subject
+
+        return video_subject(self, request)
 
     def evaluate(self, truth: Path | None, progress: Progress = silent) -> Summary:
         if truth is None:

@@ -18,6 +18,7 @@ from masiv.mpm.state import State
 from masiv.progress import Progress, silent
 from masiv.scene.transforms import SimulationFrame
 from masiv.simulation.force import ForcePulse
+from masiv.simulation.particle_fields import ParticleFields, accelerates, fields_at, stacked
 from masiv.simulation.rollout import Rollout
 from masiv.simulation.subdivide import subdivide_twin
 from masiv.simulation.twin_effects import active_effects, mass_ratio, shift_effects
@@ -31,13 +32,14 @@ def simulate_free_body(
     fps: float,
     force: ForcePulse | None = None,
     substeps: int | None = None,
+    fields: bool = False,
     progress: Progress = silent,
 ) -> Rollout:
     """``frames`` frames at k / fps [s] of the only body of ``twin``, its particles subdivided.
 
     substeps: in a frame; as many as the present speed and the effects ask for if None. If the twin's clock is late,
-    frames after the first are the states at the times when they were really taken, not before the start. Raises
-    NonFiniteError.
+    frames after the first are the states at the times when they were really taken, not before the start. fields: also
+    those of the particles; between two states they are interpolated. Raises NonFiniteError.
     """
     twin = subdivide_twin(twin)
     effects = active_effects(twin, frames=frames, fps=fps)
@@ -47,16 +49,22 @@ def simulate_free_body(
     fraction = late - (ahead - 1)
     intervals = frames - 1 + ahead
     positions: list[torch.Tensor] = []
-    for interval, (_, observed) in enumerate(_intervals(twin, effects, intervals, fraction, fps, force, substeps)):
+    felt: list[ParticleFields] = []
+    for interval, (state, observed) in enumerate(_intervals(twin, effects, intervals, fraction, fps, force, substeps)):
         if interval == 0:  # frames that would have been taken before the start show the start
             positions += [observed] * min(frames, 1 + max(0, -ahead))
         elif interval > ahead:
             positions.append(observed)
+        if fields:
+            felt.append(_fields(twin, effects, state, interval / fps, fps))
         if interval:
             progress("simulate", interval, intervals)
     axes = SimulationFrame.from_scene(twin.up, twin.ground)
     world = axes.points_to_world(torch.stack(positions).numpy())
-    return Rollout(np.asarray(world, dtype=np.float32), np.arange(frames) / fps)
+    times = np.arange(frames) / fps
+    index = np.clip(np.arange(frames) + late, 0, None) * (times > 0)
+    found = stacked(felt).at(index) if fields else None
+    return Rollout(np.asarray(world, dtype=np.float32), times, fields=found)
 
 
 def iterate_states(twin: Twin, *, frames: int, fps: float, force: ForcePulse | None = None) -> Iterator[State]:
@@ -123,6 +131,19 @@ def _intervals(
             elapsed += duration
         whole = replace(state, position=state.position + raised)
         yield whole, whole.position if observed is None else observed + raised
+
+
+def _fields(twin: Twin, effects: ActiveEffects | None, state: State, time: float, fps: float) -> ParticleFields:
+    """Of ``state`` at ``time`` [s], as ``_intervals`` gives them: the ground is where it was raised to."""
+    axes = SimulationFrame.from_scene(twin.up, twin.ground)
+    gravity = axes.vectors_to_simulation(twin.gravity)
+    if effects is not None:
+        raised = torch.zeros(3)
+        raised[1] = effects.ground_shift()
+        state, effects = replace(state, position=state.position - raised), shift_effects(effects, raised[1])
+    steps = _substeps(twin, effects, state, gravity, 1 / fps)
+    causes = [] if effects is None else [e for e, _ in effects.members if accelerates(e)]
+    return fields_at(_simulator(twin, gravity, 1 / fps / steps), twin.law, state, effects, causes, time, axes)
 
 
 def _substeps(

@@ -5,26 +5,51 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from masiv.errors import InputError
+from masiv.errors import InputError, NonFiniteError
 from masiv.models.marked_body import MarkedBody, placed_body
+from masiv.progress import Progress, silent
+from masiv.simulation.particle_fields import accelerates, fields_at, stacked
 from masiv.simulation.rollout import Rollout
 from masiv.simulation.twin_effects import effect_members
 from masiv.twin import Twin
 
 
 @torch.no_grad()
-def simulate_release(twin: Twin, *, frames: int, fps: float) -> Rollout:
-    """``frames`` frames at k / fps [s] after the release of the only body of ``twin``. Raises InputError,
-    NonFiniteError."""
+def simulate_release(
+    twin: Twin, *, frames: int, fps: float, fields: bool = False, progress: Progress = silent
+) -> Rollout:
+    """``frames`` frames at k / fps [s] after the release of the only body of ``twin``. fields: also those of the
+    particles. Raises InputError, NonFiniteError."""
     body, release = released_body(twin), twin.initial_conditions[0].release
     assert release is not None  # released_body raises otherwise
     if frames < 2:
         raise InputError(f"--frames {frames}: give at least 2")
     times = np.arange(frames) / fps
-    effects = body.effects(effect_members(twin, twin.body), body.context(float(times[-1]), 1 / fps))
-    _, positions = body.run(twin.law, times, effects)
-    world = body.axes.points_to_world(positions.double().numpy())
-    return Rollout(world.astype(np.float32), times, body.markers_to_world(positions), tuple(release.markers))
+    members = effect_members(twin, twin.body)
+    effects = body.effects(members, body.context(float(times[-1]), 1 / fps))
+    causes = [effect for effect, _ in members if accelerates(effect)]
+    substep = body.substep(twin.law, times, effects)
+    simulator = body.simulator(substep, body.contact, torch.float32)
+    ends = [round(float(t) / substep) for t in times]
+    state, at, positions, felt = body.released(), 0, [], []
+    for frame, end in enumerate(ends):
+        if end > at:
+            try:
+                state = simulator.run(state, twin.law, end - at, [], effects, at * substep).final
+            except NonFiniteError as error:
+                raise NonFiniteError(at + error.substep, error.particle, error.detail) from error
+        at = end
+        positions.append(state.position)
+        if fields:
+            felt.append(fields_at(simulator, twin.law, state, effects, causes, at * substep, body.axes))
+        if frame:
+            progress("simulate", frame, frames - 1)
+    moved = torch.stack(positions)
+    world = body.axes.points_to_world(moved.double().numpy())
+    return Rollout(
+        world.astype(np.float32), times, body.markers_to_world(moved), tuple(release.markers),
+        stacked(felt) if fields else None,
+    )  # fmt: skip
 
 
 def released_body(twin: Twin) -> MarkedBody:

@@ -36,13 +36,15 @@ def simulate(
     without: tuple[str, ...] = (),
     condition: str | None = None,
     substeps: int | None = None,
+    fields: bool = False,
     progress: Progress = silent,
 ) -> Rollout:
     """The first ``frames`` frames of the twin's motion at ``fps`` (None: that of the observation), frame 0 included.
 
     velocity (3,) [m/s], omega (3,) [rad/s] and gravity (3,) [m/s^2], world frame, replace what was identified.
     force: acts for a while. without: names of effects that are left out. condition: of the observations whose start and
-    effects are simulated (None: the first). substeps: in a frame (None: as many as the speed asks for).
+    effects are simulated (None: the first). substeps: in a frame (None: as many as the speed asks for). fields: also
+    stress, strain and accelerations by effects, see ``masiv.simulation.particle_fields``.
 
     Particles of a body that flies freely are subdivided (``simulator.subparticles``). Of several observations of one
     body the first is simulated. Raises InputError for a value that is not finite, for an effect or
@@ -69,15 +71,17 @@ def simulate(
     with runtime.torch_threads(1):
         if twin.rigid:
             _refuse("a rigid body is a point", omega=omega, force=force, substeps=substeps)
-            return simulate_flight(twin, frames=frames, fps=rate, velocity=velocity)
+            return simulate_flight(twin, frames=frames, fps=rate, velocity=velocity, fields=fields)
         if twin.initial_conditions[0].release is not None:
             _refuse("the body is let go from rest", **motion, force=force, substeps=substeps)
-            return simulate_release(twin, frames=frames, fps=rate)
+            return simulate_release(twin, frames=frames, fps=rate, fields=fields, progress=progress)
         if force is not None:
             acceleration = np.asarray(force.force) / (twin.density * twin.volume)
             ACCELERATION.check(acceleration, f"--force, on {twin.density * twin.volume:.3g} kg")
         twin = twin.with_motion(**{n: np.asarray(v, dtype=np.float64) for n, v in motion.items() if v is not None})
-        return simulate_free_body(twin, frames=frames, fps=rate, force=force, substeps=substeps, progress=progress)
+        return simulate_free_body(
+            twin, frames=frames, fps=rate, force=force, substeps=substeps, fields=fields, progress=progress
+        )
 
 
 def _refuse(why: str, **given: Any) -> None:
