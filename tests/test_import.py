@@ -13,7 +13,7 @@ import tiny_scenes as tiny
 import yaml
 
 from masiv.errors import InputError
-from masiv.footage.board import placement_of_board
+from masiv.footage.board import frame_of_board
 from masiv.footage.calibration import camera_of, read_calibration
 from masiv.footage.common_frames import MISSING, common_frames
 from masiv.footage.empty_scene import Chroma
@@ -126,7 +126,7 @@ def test_a_lens_that_readers_do_not_know_is_undistorted_once(tmp_path, model):
         tmp_path, footage=tmp_path / "footage", calibration=calibration, recorded_fps=RATE, scale=1.0
     )
     assert json.loads((tmp_path / "scene/transforms.json").read_text())["frames"][0]["camera_model"] == "PINHOLE"
-    assert_dot_is_in_place(scene, summary, tolerance=0.05, by_colour=True)
+    assert_dot_is_in_place(scene, summary, tolerance=0.08, by_colour=True)
     bent = [pixel(view, made.dot(0)) - tiny.pixel(view, made.dot(0)) for view in range(3)]
     assert np.abs(bent).max() > 0.3  # what a pinhole camera would be off by
 
@@ -343,7 +343,7 @@ def test_scale_and_ground_by_a_checkerboard(tmp_path):
         size = (10 * tiny.WIDTH, 10 * tiny.HEIGHT)
         drawn = cv2.warpPerspective(flat, transform, size, flags=cv2.INTER_AREA, borderValue=200)
         assert cv2.imwrite(str(tmp_path / "board" / f"{name}.png"), drawn)
-    found = placement_of_board(tmp_path / "board", (columns, rows, square), cameras)
+    found = frame_of_board(tmp_path / "board", (columns, rows, square), cameras)
     assert found.metres == pytest.approx(0.5, rel=3e-3)
     normal, height = found.ground
     assert normal @ [0, 1, 0] > np.cos(np.radians(0.5))

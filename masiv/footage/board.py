@@ -11,8 +11,8 @@ import numpy as np
 
 from masiv.errors import InputError
 from masiv.footage.calibrated_camera import CalibratedCamera
-from masiv.footage.placement import LARGEST_MISS, Placement, plane_of, scale_of, triangulate
 from masiv.footage.recordings import PICTURES
+from masiv.footage.world_frame import LARGEST_MISS, WorldFrame, plane_of, scale_of, triangulate
 from masiv.scene.pictures import read_pixels
 
 
@@ -31,8 +31,8 @@ def parse_board(text: str) -> tuple[int, int, float]:
     return columns, rows, square
 
 
-def placement_of_board(folder: Path, size: tuple[int, int, float], cameras: Sequence[CalibratedCamera]) -> Placement:
-    """Placement by a checkerboard in the pictures ``folder``/CAMERA.png, one a camera, at one place.
+def frame_of_board(folder: Path, size: tuple[int, int, float], cameras: Sequence[CalibratedCamera]) -> WorldFrame:
+    """Scale, up axis and ground by a checkerboard in the pictures ``folder``/CAMERA.png, one a camera, at one place.
 
     Raises InputError if fewer than two cameras see it, or if they do not agree about it.
     """
@@ -61,7 +61,7 @@ def placement_of_board(folder: Path, size: tuple[int, int, float], cameras: Sequ
     across = np.linalg.norm(np.diff(points, axis=0), axis=-1).mean()
     metres = scale_of(np.array([along, across]), np.array([square, square]), f"--board {folder}")
     ground = plane_of(metres * points.reshape(-1, 3), cameras, metres, f"--board {folder}")
-    return Placement(metres, ground[0], ground)
+    return WorldFrame(metres, ground[0], ground)
 
 
 def _corners(folder: Path, seen: list[tuple[CalibratedCamera, np.ndarray]]) -> np.ndarray:

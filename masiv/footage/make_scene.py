@@ -23,7 +23,7 @@ from masiv.footage.recordings import Recording, find_recordings, open_recording
 from masiv.footage.request import ImportRequest
 from masiv.footage.times import timed
 from masiv.footage.view import View, write_view
-from masiv.footage.world import place
+from masiv.footage.world import in_metres
 from masiv.observations.read import read_scene
 from masiv.progress import Progress, silent
 from masiv.scene.segmenter import VideoSegmenter
@@ -49,7 +49,7 @@ def make_scene(request: ImportRequest, out: Path, *, progress: Progress = silent
         for name, path in paths.items()
     ]
     filmed = [replace(c, name=r.name).resized(*r.size) for c, r in zip(found, recordings, strict=True)]
-    placed, world = place(request, filmed)
+    placed, world = in_metres(request, filmed)
     zeros = clocks.zeros(recordings, request.sync)
     added = [request.offsets.get(name, 0.0) for name in paths]
     views = [

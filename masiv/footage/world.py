@@ -9,20 +9,22 @@ import numpy as np
 
 from masiv.bounds import LENGTH
 from masiv.errors import InputError
-from masiv.footage.board import placement_of_board
+from masiv.footage.board import frame_of_board
 from masiv.footage.calibrated_camera import CalibratedCamera
-from masiv.footage.placement import (
-    Placement,
+from masiv.footage.request import ImportRequest
+from masiv.footage.world_frame import (
+    WorldFrame,
     baseline,
     check_distances,
-    placement_of,
+    frame_of,
     read_landmarks,
 )
-from masiv.footage.request import ImportRequest
 from masiv.scene.declaration import AXES
 
 
-def place(request: ImportRequest, cameras: Sequence[CalibratedCamera]) -> tuple[list[CalibratedCamera], dict[str, Any]]:
+def in_metres(
+    request: ImportRequest, cameras: Sequence[CalibratedCamera]
+) -> tuple[list[CalibratedCamera], dict[str, Any]]:
     """``cameras``, of the footage's size, in metres, and the keys up_axis and ground of scene.yaml.
 
     Raises InputError if two options say the unit of length, or if none does and the calibration has none.
@@ -42,14 +44,14 @@ def place(request: ImportRequest, cameras: Sequence[CalibratedCamera]) -> tuple[
             f"{request.calibration}: COLMAP's unit of length is arbitrary: give --baseline, --landmarks or --board, or "
             "--scale with the metres of a unit"
         )
-    found = Placement()
+    found = WorldFrame()
     if landmarks is not None:
         assert request.landmarks is not None
-        found = placement_of(landmarks, cameras, request.landmarks)
+        found = frame_of(landmarks, cameras, request.landmarks)
     elif request.board is not None:
         if request.board_size is None:
             raise InputError("--board needs --board-size, for example 9x6x0.025")
-        found = placement_of_board(request.board, request.board_size, cameras)
+        found = frame_of_board(request.board, request.board_size, cameras)
     metres = found.metres
     if request.scale is not None:
         if not request.scale > 0:
@@ -60,13 +62,13 @@ def place(request: ImportRequest, cameras: Sequence[CalibratedCamera]) -> tuple[
         one, other, length = request.baseline
         metres = baseline(cameras, (one, other), length)
     if landmarks is not None and not landmarks.distances and found.ground is not None:
-        found = Placement(metres, found.up, (found.ground[0], found.ground[1] * metres))
+        found = WorldFrame(metres, found.up, (found.ground[0], found.ground[1] * metres))
     placed = [camera.scaled(metres) for camera in cameras]
     check_distances(placed)
     return placed, {"metres": metres, **_declared(request, found)}
 
 
-def _declared(request: ImportRequest, found: Placement) -> dict[str, Any]:
+def _declared(request: ImportRequest, found: WorldFrame) -> dict[str, Any]:
     up: Any = request.up
     if up is None and found.up is not None:
         up = found.up

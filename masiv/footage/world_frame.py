@@ -38,7 +38,7 @@ class Landmarks(BaseModel):
 
 
 @dataclass(frozen=True)
-class Placement:
+class WorldFrame:
     """metres: of one unit of the calibration. up: unit vector (3,) or None. ground: (normal, height [m]) or None."""
 
     metres: float = 1.0
@@ -59,7 +59,7 @@ def read_landmarks(path: Path) -> Landmarks:
     return landmarks
 
 
-def placement_of(landmarks: Landmarks, cameras: Sequence[CalibratedCamera], where: Path) -> Placement:
+def frame_of(landmarks: Landmarks, cameras: Sequence[CalibratedCamera], where: Path) -> WorldFrame:
     """Scale, up axis and ground that ``landmarks`` say; ``cameras`` are those of the footage, in its size."""
     by_name = {camera.name: camera for camera in cameras}
     points: dict[str, np.ndarray] = {}
@@ -87,7 +87,7 @@ def placement_of(landmarks: Landmarks, cameras: Sequence[CalibratedCamera], wher
     ground = None
     if landmarks.ground:
         ground = plane_of(metres * np.array([points[name] for name in landmarks.ground]), cameras, metres, str(where))
-    return Placement(metres, up if up is not None or ground is None else ground[0], ground)
+    return WorldFrame(metres, up if up is not None or ground is None else ground[0], ground)
 
 
 def triangulate(cameras: Sequence[CalibratedCamera], pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
