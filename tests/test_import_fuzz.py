@@ -38,10 +38,11 @@ def test_damage_is_an_input_error_or_harmless(files, data):
     length = data.draw(st.integers(0, 12))
     put = data.draw(st.binary(max_size=12) | st.sampled_from([b"nan", b"-1", b"1e999", b"[", b'"', b"\n", b"9" * 400]))
     path.write_bytes(data.draw(st.sampled_from([whole[:start] + put + whole[start + length :], whole[:start]])))
+    said = "read"
     try:
         (read_landmarks if path.suffix == ".yaml" else read_calibration)(read)
     except InputError as error:
-        assert "\n" not in str(error)
-        assert str(error)
+        said = str(error)
     finally:
         path.write_bytes(whole)
+    assert len(said.splitlines()) == 1
