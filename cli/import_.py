@@ -7,7 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import JsonOption, numbers, pairs, vector
+from .options import (
+    ArchOption,
+    ConfigOption,
+    JsonOption,
+    PresetOption,
+    SeedOption,
+    SetOption,
+    numbers,
+    pairs,
+    vector,
+)
 
 _Several = list[str] | None
 
@@ -98,12 +108,18 @@ def import_footage(
     up: Annotated[str | None, typer.Option(help="Up axis of the calibration: x, -y, … or three numbers.")] = None,
     ground: Annotated[str | None, typer.Option(help="Height of the ground along the up axis [m], or none.")] = None,
     density: Annotated[float | None, typer.Option(help="Of the object [kg/m³]. [default: 1000]")] = None,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    preset: PresetOption = None,
+    arch: ArchOption = None,
+    seed: SeedOption = None,
     as_json: JsonOption = False,
 ) -> tuple[dict[str, Any], str]:
     """Make a scene from videos or pictures of several cameras and their calibration.
 
     Example: `masiv import videos --calibration calibration.toml --sync flash --plates empty --out SCENE`
     """
+    from masiv.config import load_config
     from masiv.footage.board import parse_board
     from masiv.footage.empty_scene import parse_chroma
     from masiv.footage.make_scene import make_scene
@@ -111,6 +127,7 @@ def import_footage(
 
     from .console import progress_bar
 
+    load_config(preset, config, assignments=assignments or (), seed=seed, arch=arch)  # no setting acts; all are checked
     rates = {name: numbers(value, "--recorded-fps", 1)[0] for name, value in pairs(recorded_fps, "--recorded-fps", "")}
     boxes = {name: numbers(value, "--box", 4) for name, value in pairs(box, "--box")}
     line = None
