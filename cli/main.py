@@ -13,6 +13,7 @@ from . import console
 from .config import config
 from .evaluate import evaluate
 from .identify import identify
+from .import_ import import_footage
 from .inspect import inspect
 from .pretrain import pretrain
 from .reconstruct import reconstruct
@@ -32,6 +33,7 @@ app = typer.Typer(
 )
 for function in (identify, inspect, reconstruct, trajectory, refine, simulate, evaluate, view, pretrain, synth, config):
     app.command()(console.command(function))
+app.command("import")(console.command(import_footage))
 
 
 def _print_version(asked: bool) -> None:

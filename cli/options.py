@@ -70,3 +70,37 @@ def vector(text: str | None, flag: str) -> np.ndarray | None:
     if len(values) != 3 or not all(map(math.isfinite, values)):
         raise InputError(f"{flag} {text}: give three finite numbers with commas, for example {flag}=0,-1.5,0")
     return np.array(values)
+
+
+def numbers(text: str, flag: str, count: int) -> tuple[float, ...]:
+    """'0.5,2' as ``count`` finite numbers. Raises InputError."""
+    import math
+
+    from masiv.errors import InputError
+
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(map(math.isfinite, values)):
+        several = f"{count} finite numbers with commas" if count > 1 else "a finite number"
+        raise InputError(f"{flag} {text}: give {several}")
+    return values
+
+
+def pairs(texts: list[str] | None, flag: str, unnamed: str | None = None) -> list[tuple[str, str]]:
+    """'NAME=VALUE' as pairs; ``unnamed`` is the name of a value without one. Raises InputError, also for a name that is
+    given twice."""
+    from masiv.errors import InputError
+
+    found: dict[str, str] = {}
+    for text in texts or []:
+        name, equals, value = text.partition("=")
+        if not equals and unnamed is not None:
+            name, value = unnamed, text
+        if not value or (not name and unnamed is None):
+            raise InputError(f"{flag} {text}: give {flag} NAME=VALUE")
+        if name in found:
+            raise InputError(f"{flag} is given twice for {name or 'all'}")
+        found[name] = value
+    return list(found.items())
