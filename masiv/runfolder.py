@@ -332,7 +332,7 @@ def _with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
         both = {key: over(low[key], high[key]) for key in low if isinstance(low[key], dict) and key in high}
         return {**low, **high, **both}
 
-    return over(Config().model_dump(mode="json"), config)
+    return over(Config.model_validate({}).model_dump(mode="json"), config)
 
 
 def _differences(name: str, old: Any, new: Any) -> list[str]:
