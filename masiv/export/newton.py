@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +14,12 @@ from masiv.files import atomic_folder, write_json, write_npz
 
 if TYPE_CHECKING:
     from masiv.twin import Twin
-    from masiv.twin.body import TwinEffect
+    from masiv.twin.body import Body, TwinEffect
 
 NEWTON_VERSION = "1.8"
 SCRIPT = Path(__file__).with_name("newton_scene.py")
 STICKING = 1e3
 """Coefficient of friction [1] of a ground along which nothing slides."""
-STICKING_PRESSURE = 1e6
-"""Adhesion [Pa] of a ground that holds what touches it: more than the stresses of bodies that deform visibly."""
 REPRESENTED = ("gravity_scale", "body_force", "ground_height")
 
 
@@ -57,16 +56,18 @@ def newton_scene(
     place = start.placement
     positions = np.asarray(twin.positions if place is None else place.to_world(twin.positions), np.float64)
     arms = positions - positions.mean(axis=0)
-    held = np.zeros(len(positions), bool) if body.clamp is None else body.clamp.holds(twin.positions)
+    spacing = (body.volume / len(positions)) ** (1 / 3)
+    held = _held(body, twin.positions, spacing)
     masses = np.where(held, 0.0, body.density * body.volume / len(positions))
     velocities = np.where(held[:, None], 0.0, start.velocity + np.cross(start.omega, arms))
     values, notes = newton_material(twin.law, None if material is None else material.get("quantities"))
-    notes = [*notes, "grid and time steps are implicit ones: contact and damping differ from the twin's"]
+    notes += ["the solver is implicit: contact and damping differ from the twin's, and impacts lose energy"]
+    if body.clamp is not None:
+        notes.append("the clamp holds particles up to a particle spacing away from it, in place of grid nodes inside")
     if start.release is not None:
         notes.append("the body starts at rest in its undeformed shape: how it was held before its release is left out")
     gravity, shift = _exact_effects(twin)
     notes += [_left_out(effect) for effect in twin.effects if effect.name not in REPRESENTED]
-    spacing = (body.volume / len(positions)) ** (1 / 3)
     settings = {
         "newton": NEWTON_VERSION,
         "fps": start.fps,
@@ -81,6 +82,13 @@ def newton_scene(
     return settings, {name: array.astype(np.float32) for name, array in arrays.items()}, notes
 
 
+def _held(body: Body, own: np.ndarray, spacing: float) -> np.ndarray:
+    """Which particles (Q,) are held: those in the clamp or within a ``spacing`` [m] of it, own axes."""
+    if body.clamp is None:
+        return np.zeros(len(own), bool)
+    return replace(body.clamp, heights=body.clamp.heights + spacing).holds(own)
+
+
 def _ground(twin: Twin, shift: float) -> dict[str, Any] | None:
     if twin.ground is None or twin.contact == "none":
         return None
@@ -88,7 +96,6 @@ def _ground(twin: Twin, shift: float) -> dict[str, Any] | None:
         "normal": np.asarray(twin.ground.normal).tolist(),
         "height_m": float(twin.ground.height) + shift,
         "friction": twin.friction if twin.contact == "slip" else STICKING,
-        "adhesion_pa": STICKING_PRESSURE if twin.contact == "sticky" else 0.0,
     }
 
 

@@ -42,16 +42,13 @@ def build(settings, particles):
     ground = settings["ground"]
     if ground is not None:
         contact = newton.ModelBuilder.ShapeConfig(mu=ground["friction"])
-        shape = builder.add_shape_plane(plane=(*ground["normal"], -ground["height_m"]), width=0, length=0, cfg=contact)
+        builder.add_shape_plane(plane=(*ground["normal"], -ground["height_m"]), width=0, length=0, cfg=contact)
     model = builder.finalize()
     model.set_gravity(tuple(settings["gravity_m_s2"]))
-    if ground is not None:
-        adhesion = model.mpm.collider_adhesion.numpy()
-        adhesion[shape] = ground["adhesion_pa"]
-        model.mpm.collider_adhesion.assign(adhesion)
     grid = "sparse" if model.device.is_cuda else "dense"
+    # Without a warm start: those of Newton 1.8 made soft bodies diverge.
     config = SolverImplicitMPM.Config(
-        voxel_size=settings["voxel_size_m"], grid_type=grid, air_drag=0.0, warmstart_mode="particles"
+        voxel_size=settings["voxel_size_m"], grid_type=grid, air_drag=0.0, warmstart_mode="none"
     )
     return model, SolverImplicitMPM(model, config=config)
 
@@ -60,12 +57,12 @@ def simulate(settings, particles, frames, substeps):
     """Positions (frames, Q, 3) [m] at k / fps, frame 0 included."""
     model, solver = build(settings, particles)
     now, after = model.state(), model.state()
-    positions = [now.particle_q.numpy()]
+    positions = [now.particle_q.numpy().copy()]  # on a CPU, numpy() is a view
     for _ in range(frames - 1):
         for _ in range(substeps):
             solver.step(now, after, None, None, 1 / (settings["fps"] * substeps))
             now, after = after, now
-        positions.append(now.particle_q.numpy())
+        positions.append(now.particle_q.numpy().copy())
     return np.stack(positions).astype(np.float32)
 
 

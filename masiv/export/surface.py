@@ -17,9 +17,9 @@ RADIUS = 0.5
 SMOOTHING_LENGTH, CELL = 2.0, 1.5
 """Smoothing length and edge of the cells of marching cubes, over the radius."""
 ISO_VALUE = 0.6
-"""Of the color field, at the surface. Chosen: a cube of 12³ particles then has its volume within 3 %."""
-SMOOTHING_STEPS, NORMAL_STEPS = 10, 5
-"""Steps of Laplacian smoothing, of vertices and of normals. Chosen: the lattice of the particles no longer shows."""
+"""Of the color field, at the surface: a flat face of a lattice is then half a spacing outside of its last layer."""
+SMOOTHING_STEPS = 5
+"""Of Laplacian smoothing. Chosen: steps of the lattice become slopes; corners are rounded over about a spacing."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,6 @@ def reconstruct_surface(points: np.ndarray, spacing: float | None = None) -> Sur
         mesh_cleanup=True,
         mesh_smoothing_weights=True,
         mesh_smoothing_iters=SMOOTHING_STEPS,
-        normals_smoothing_iters=NORMAL_STEPS,
-        compute_normals=True,
     )
     vertices, triangles = np.array(made.mesh.vertices), np.array(made.mesh.triangles).astype(np.int32)
     if len(triangles) == 0:
