@@ -49,6 +49,7 @@ def reconstruct_surface(points: np.ndarray, spacing: float | None = None) -> Sur
         smoothing_length=SMOOTHING_LENGTH,
         cube_size=CELL,
         iso_surface_threshold=ISO_VALUE,
+        multi_threading=False,  # the order of vertices would differ from call to call
         mesh_cleanup=True,
         mesh_smoothing_weights=True,
         mesh_smoothing_iters=SMOOTHING_STEPS,

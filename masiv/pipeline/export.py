@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from masiv.files import read_npz
 from masiv.pipeline.requests import Summary
 from masiv.pipeline.stages import load_gaussians
 from masiv.progress import Progress, silent
-from masiv.report.sections.material import read_material
+from masiv.report.sections.material import MATERIAL, read_material
 from masiv.runfolder import RunFolder, load_motion, refuse_run
 
 if TYPE_CHECKING:
@@ -61,8 +62,21 @@ class Source:
         return np.array([0.0, 1.0, 0.0]) if self.run is None else np.array(self.twin().up)
 
     def material(self) -> dict[str, Any] | None:
-        """material.json of the run."""
-        return None if self.run is None else read_material(self.run.path)
+        """material.json of the run, if it has one. Raises InputError if ``excited`` or ``quantities`` in it are not
+        what masiv writes."""
+        material = None if self.run is None else read_material(self.run.path)
+        if material is not None:
+            try:
+                excited = material.get("excited") or {"strain": [0.0, 1.0], "rate": 1.0}
+                rows = (material.get("quantities") or {}).values()
+                numbers = [excited["strain"][1], excited["rate"], *(row["value"] for row in rows)]
+                if not all(number is None or math.isfinite(number) for number in numbers):
+                    raise ValueError("a number is not finite")
+            except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+                assert self.run is not None
+                where = self.run.path / MATERIAL
+                raise InputError(f"{where} is damaged ({error}): delete it and run masiv identify again") from error
+        return material
 
 
 @dataclass(frozen=True)
@@ -123,7 +137,7 @@ def _law(source: Source, path: Path, progress: Progress) -> list[str]:
 
     twin = _deformable_twin(source, "law")
     material = source.material()
-    if material is None:
+    if material is None or not material.get("excited"):
         write_law_csv(twin.law, path)
         return [f"strains up to {STRAIN:g} at {RATE:g}/s"]
     from masiv.characterization.describe import MAX_TEST_STRAIN, MIN_TEST_STRAIN
