@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .options import ArchOption, JsonOption
+from .options import ArchOption, ConfigOption, JsonOption, PresetOption, SeedOption, SetOption
 
 
 def export(
@@ -32,7 +32,11 @@ def export(
     motion: Annotated[
         str, typer.Option("--motion", help="rollout: of the twin. trajectory: as observed, of pictures and clouds.")
     ] = "rollout",
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    preset: PresetOption = None,
     arch: ArchOption = None,
+    seed: SeedOption = None,
     as_json: JsonOption = False,
 ) -> tuple[dict[str, Any], str]:
     """Write the motion, the law or the twin for ParaView, Blender, viewers of 3DGS, spreadsheets or Newton.
@@ -41,12 +45,14 @@ def export(
 
     Another: `masiv export moon --run runs/bunny --format 3dgs --out moon_gaussians`
     """
+    from masiv.config import load_config
     from masiv.pipeline import export_results
 
     from .console import progress_bar
 
+    settings = load_config(preset, config, assignments=assignments or (), seed=seed, arch=arch)
     with progress_bar() as progress:
         result = export_results(
-            folder, format, out, run=run, motion=motion, arch=arch or "cpu", progress=progress
+            folder, format, out, run=run, motion=motion, arch=settings.arch, progress=progress
         )  # fmt: skip
     return result.data, result.text
