@@ -12,6 +12,7 @@ import masiv
 from . import console
 from .config import config
 from .evaluate import evaluate
+from .export import export
 from .identify import identify
 from .import_ import import_footage
 from .inspect import inspect
@@ -31,7 +32,8 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-for function in (identify, inspect, reconstruct, trajectory, refine, simulate, evaluate, view, pretrain, synth, config):
+_JOBS = identify, inspect, reconstruct, trajectory, refine, simulate, evaluate
+for function in (*_JOBS, view, export, pretrain, synth, config):
     app.command()(console.command(function))
 app.command("import")(console.command(import_footage))
 

@@ -1,6 +1,7 @@
 """masiv: digital twins of moving, deforming objects, from multi-view video or tracked points.
 
-The library is documented in ``masiv.api``; run folders and the stages of the commands in ``masiv.pipeline``.
+The library is documented in ``masiv.api``; run folders and the stages of the commands in ``masiv.pipeline``,
+results in the formats of other programs in ``masiv.export``.
 """
 
 import importlib
@@ -14,6 +15,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from masiv import export
     from masiv.api import (
         calibrated,
         estimate_trajectory,
@@ -50,6 +52,8 @@ _MODULE_OF = {
     "Config": "masiv.config",
     "Twin": "masiv.twin",
 }
+_PACKAGES = ("export",)
+"""Packages whose functions are part of the library under their own name."""
 
 __all__ = [
     "Config",
@@ -63,6 +67,7 @@ __all__ = [
     "calibrated",
     "estimate_trajectory",
     "evaluate",
+    "export",
     "identify",
     "load_config",
     "open_run",
@@ -76,6 +81,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Names are imported when they are used: torch and Taichi take seconds, and ``masiv --help`` needs neither."""
+    if name in _PACKAGES:
+        return importlib.import_module(f"masiv.{name}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'masiv' has no attribute '{name}'")
     return getattr(importlib.import_module(_MODULE_OF[name]), name)

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,11 +56,35 @@ def atomic(path: Path) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder to write to. It becomes ``path`` when the block ends without error. Raises InputError if
+    ``path`` exists and is no empty folder."""
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError(f"{path} exists already: give another folder")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.mkdir()
+        yield temporary
+        if path.exists():
+            path.rmdir()
+        os.replace(temporary, path)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
+        raise
+
+
 def remove_temporary(folder: Path) -> None:
-    """Delete what ``atomic`` left in ``folder`` and in the folders below when its process was killed."""
-    for path in folder.rglob("*.tmp*"):
+    """Delete what ``atomic`` and ``atomic_folder`` left in ``folder`` and below when their process was killed."""
+    for path in list(folder.rglob("*.tmp*")):
         if re.search(r"\.\d+\.tmp(\.\w+)?$", path.name):
-            path.unlink(missing_ok=True)
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
 
 
 def _remove(path: Path) -> None:

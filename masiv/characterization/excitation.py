@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from masiv.characterization.curves import moduli_at_rest
 from masiv.errors import InputError, NonFiniteError
+from masiv.local_gradient import local_gradients
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.law import Law
 from masiv.materials.measures import deviatoric_strain
@@ -84,11 +85,8 @@ def excited_range(states: Iterable[State]) -> Excited:
 
 
 def _total_gradient(rest: np.ndarray, now: np.ndarray) -> torch.Tensor:
-    """Least-squares gradients (M, 3, 3) that take neighbourhoods (M, k, 3) [m] from ``rest`` to ``now``."""
-    before, after = rest - rest.mean(1, keepdims=True), now - now.mean(1, keepdims=True)
-    spread = np.einsum("mki,mkj->mij", before, before)
-    ridge = 1e-9 * np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    f = torch.as_tensor(np.einsum("mki,mkj->mij", after, before) @ np.linalg.inv(spread + ridge))
+    """``local_gradients`` (M, 3, 3) of neighbourhoods that are not turned inside out."""
+    f = torch.as_tensor(local_gradients(rest, now))
     return f[torch.linalg.det(f) > 0]
 
 

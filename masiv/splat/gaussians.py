@@ -17,10 +17,9 @@ _SH_DEGREE_0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 1/2 + _SH_DEGREE_0 f_dc."""
 _OPACITY_MARGIN = 1e-6
 """Opacities are stored as logits, which are infinite at 0 and 1."""
-_COLUMNS = (
-    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
+_POINT = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+_SHAPE = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+_COLUMNS = (*_POINT, *_SHAPE)
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,13 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def save_ply(self, path: Path) -> None:
-        """Write ``path`` (float32, binary PLY) completely or not at all. Raises MasivError for non-finite values."""
+    def save_ply(self, path: Path, *, sh_degree: int = 0) -> None:
+        """Write ``path`` (float32, binary PLY) completely or not at all. sh_degree: of the spherical harmonics in the
+        file, which are zero above 0; many loaders ask for 3. Raises MasivError for non-finite values."""
         count = len(self)
-        columns: dict[str, np.ndarray] = {name: np.zeros(count) for name in _COLUMNS}
+        rest = tuple(f"f_rest_{k}" for k in range(3 * ((sh_degree + 1) ** 2 - 1)))
+        names = (*_POINT, *rest, *_SHAPE)
+        columns: dict[str, np.ndarray] = {name: np.zeros(count) for name in names}
         means, colours = self.means.detach().cpu().numpy(), self.colours.detach().cpu().numpy()
         for axis, name in enumerate("xyz"):
             columns[name] = means[:, axis]
@@ -48,7 +50,7 @@ class Gaussians:
         opacities = self.opacities.detach().double().clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
         columns["opacity"] = torch.logit(opacities).cpu().numpy()
         columns["rot_0"] = np.ones(count)
-        rows = np.empty(count, dtype=[(name, "f4") for name in _COLUMNS])
+        rows = np.empty(count, dtype=[(name, "f4") for name in names])
         for name, column in columns.items():
             if not np.isfinite(column).all():
                 raise MasivError(f"{path} is not written: a Gaussian's {name} is not finite")
