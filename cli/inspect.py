@@ -22,7 +22,7 @@ def inspect(
     seed: SeedOption = None,
     as_json: JsonOption = False,
 ) -> tuple[dict[str, Any], str]:
-    """Show what was read: cameras or markers, frames, units, up axis, masks, problems; and draw it.
+    """Show what was read, what is wrong with it, and what the motion will tell of the body; and draw it.
 
     Example: `masiv inspect scenes/bunny --out bunny.png`
     """

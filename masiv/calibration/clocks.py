@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from masiv.calibration.config import CalibrationPrior
+from masiv.calibration.consistency import Consistency
 from masiv.calibration.from_silhouettes import MAX_FRAMES, SilhouetteFit, fit_silhouettes
 from masiv.calibration.frontier import Outlines, tangent_angles
 from masiv.calibration.gauge import displacement_jacobian
@@ -33,8 +34,9 @@ MIN_Z = 5.0
 had up to 4.4 (``benchmarks/inspect_calibration.py``)."""
 MIN_MOVE_PX = 1.0
 """Motion of the object in the picture during an offset below which it does not matter: outlines are known no better."""
-BROAD_PRIOR = CalibrationPrior(time_frames=3.0)
-"""The remaining offset is below a frame; what silhouettes disagree limits it further (``gauge.scaled_deviations``)."""
+BROAD_PRIOR = CalibrationPrior(rotation_deg=2.0, translation_fraction=0.02, focal_fraction=0.03, time_frames=3.0)
+"""Errors that ``inspect`` should find are larger than those that a fit corrects, of poses too: a pose that may not move
+would look like a clock. How far silhouettes disagree limits all of it further (``gauge.scaled_deviations``)."""
 
 
 @dataclass(frozen=True)
@@ -86,13 +88,17 @@ def clocks(
     return Clocks(views, found, np.maximum(fit.clock_errors, 1e-12), moves)
 
 
-def late_cameras(scene: Scene, found: Clocks) -> dict[int, str]:
-    """A sentence for each view of ``scene`` whose clock is off, by index."""
+def late_cameras(scene: Scene, found: Clocks, agreement: Consistency) -> dict[int, str]:
+    """A sentence for each view of ``scene`` whose clock is off, by index.
+
+    If silhouettes disagree by more than twice the motion of the object during the offset, the cause is another one, and
+    the offset is what a fit takes for it.
+    """
     said = {}
-    for view, offset, error, z, moves in zip(
-        found.views, found.offsets, found.standard_errors, found.z, found.moves_px, strict=True
+    for view, offset, error, z, moves, disagrees in zip(
+        found.views, found.offsets, found.standard_errors, found.z, found.moves_px, agreement.pixels, strict=True
     ):
-        if abs(z) > MIN_Z and moves > MIN_MOVE_PX:
+        if abs(z) > MIN_Z and moves > MIN_MOVE_PX and not disagrees > 2 * moves:
             said[view] = (
                 f"view {view} ({scene.cameras[view].name}): its pictures are {1e3 * abs(offset):.1f} ± "
                 f"{1e3 * error:.1f} ms ({abs(offset) * scene.fps:.2f} frames) "

@@ -1,13 +1,14 @@
 """Masks that are wrong in single frames: flicker.
 
 The outline of a frame is compared with those of the other cameras at the same frame by epipolar tangency
-(``tangency``), which needs no smooth motion: an impact is no jump. The constant part of the error is the calibration's. A hole does not
-move the outline: it is off in one mask and well inside of those before and after.
+(``tangency``), which needs no smooth motion: an impact is no jump. The constant part of the error is the calibration's.
+A hole does not move the outline: it is off in one mask and well inside of those before and after.
 """
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
@@ -30,6 +31,8 @@ EDGE_PX = 2
 QUANTILE = 0.75
 """Of the errors against the other cameras, over cameras and tangents. A mask that is wrong at one end has a wrong
 tangent in half of them; one wrong mask among others concerns one pair of many."""
+MAX_SHARE = 1 / 3
+"""Of the frames. What is wrong more often is no flicker, but a calibration or a clock."""
 FEWEST_FRAMES = 5
 """With fewer, the usual error is not known."""
 
@@ -65,7 +68,8 @@ def flicker(views: tuple[int, ...], series: np.ndarray, holes: np.ndarray) -> Fl
             found[view].add(int(frame))
             known[view, :, frame] = known[:, view, frame] = np.nan
             now = _outline_errors(known)
-    return Flicker(views, outline, holes, tuple(tuple(sorted(frames)) for frames in found))
+    few = [frames if len(frames) <= MAX_SHARE * series.shape[2] else set() for frames in found]
+    return Flicker(views, outline, holes, tuple(tuple(sorted(frames)) for frames in few))
 
 
 def hole_share(before: np.ndarray, mask: np.ndarray, after: np.ndarray) -> float:
@@ -78,21 +82,21 @@ def hole_share(before: np.ndarray, mask: np.ndarray, after: np.ndarray) -> float
     inside = cv2.erode(full, np.ones((2 * EDGE_PX + 1,) * 2, np.uint8))
     enclosed = _enclosed(mask)
     usual = max(int(_enclosed(before).sum()), int(_enclosed(after).sum()))
-    return max(0.0, float(min((inside & enclosed).sum(), enclosed.sum() - usual)) / area)
+    return max(0, min(int((inside & enclosed).sum()), int(enclosed.sum()) - usual) / area)
 
 
 def _enclosed(mask: np.ndarray) -> np.ndarray:
     """What is off in ``mask`` (H, W) and inside of its outer contours, uint8."""
     on = (mask > 0.5).astype(np.uint8)
     outer, _ = cv2.findContours(on, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return cv2.drawContours(np.zeros_like(on), outer, -1, 1, cv2.FILLED) & (1 - on)
+    return np.asarray(cv2.drawContours(np.zeros_like(on), outer, -1, 1, cv2.FILLED)) & (1 - on)
 
 
-def flickering_masks(scene: Scene, found: Flicker) -> list[str]:
-    """A sentence for each view of ``scene`` whose masks flicker."""
+def flickering_masks(scene: Scene, found: Flicker, but: Collection[int | None]) -> list[str]:
+    """A sentence for each view of ``scene`` whose masks flicker; none for the views ``but``, which are wrong always."""
     said = []
     for row, (view, frames) in enumerate(zip(found.views, found.frames, strict=True)):
-        if not frames:
+        if not frames or view in but:
             continue
         outline = float(np.nan_to_num(found.outline[row, list(frames)]).max())
         hole = float(np.nan_to_num(found.holes[row, list(frames)]).max())

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from masiv.calibration.frontier import Outlines, world_rays
+from masiv.calibration.tangency import Outline
 from masiv.scene.camera import Camera
 
 PER_OUTLINE = 8
@@ -26,13 +28,21 @@ class OutlinePoints:
     velocities: np.ndarray
 
 
-def ray_centres(cameras: Sequence[Camera], outlines: Outlines) -> tuple[np.ndarray, np.ndarray]:
-    """Index (K,) of the frames that two of V cameras show, and the object's centre (K, 3) [m] in them: the point
-    nearest to the rays through the middles of the outlines."""
-    if not outlines.hulls.size:
-        return np.zeros(0, int), np.zeros((0, 3))
-    rays = [world_rays(camera, hulls) for camera, hulls in zip(cameras, outlines.hulls, strict=True)]
-    middles = _unit(np.stack(rays).mean(axis=2))
+def area_middles(cameras: Sequence[Camera], outlines: Sequence[Sequence[Outline | None]]) -> np.ndarray:
+    """Unit rays (V, F, 3) through the centroids of the areas of V lists of F outlines, NaN where there is none."""
+    middles = np.full((len(cameras), len(outlines[0]), 2), np.nan)
+    for row, seen in zip(middles, outlines, strict=True):
+        for middle, one in zip(row, seen, strict=True):
+            if one is not None:
+                moments = cv2.moments(one.hull.astype(np.float32))
+                if moments["m00"] > 0:
+                    middle[:] = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
+    return np.stack([_unit(world_rays(camera, row)) for camera, row in zip(cameras, middles, strict=True)])
+
+
+def ray_centres(cameras: Sequence[Camera], middles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index (K,) of the frames that two of V cameras show, and the point (K, 3) [m] nearest to the unit rays
+    ``middles`` (V, F, 3) in them; NaN where a camera shows nothing."""
     seen = np.asarray(np.isfinite(middles).all(axis=-1))
     frames = np.flatnonzero(seen.sum(axis=0) >= 2)
     along = np.where(seen[..., None], middles, 0)[:, frames]
@@ -42,8 +52,12 @@ def ray_centres(cameras: Sequence[Camera], outlines: Outlines) -> tuple[np.ndarr
 
 
 def outline_points(cameras: Sequence[Camera], outlines: Outlines, fps: float) -> OutlinePoints | None:
-    """Of V cameras, about their ``ray_centres``; None if no frame has one."""
-    frames, centres = ray_centres(cameras, outlines)
+    """Of V cameras. The centre at a frame is the point nearest to the rays through the middles of the outlines; None if
+    no frame has two."""
+    if not outlines.hulls.size:
+        return None
+    rays = [world_rays(camera, hulls) for camera, hulls in zip(cameras, outlines.hulls, strict=True)]
+    frames, centres = ray_centres(cameras, _unit(np.stack(rays).mean(axis=2)))
     if not len(frames):
         return None
     velocities = np.zeros_like(centres)

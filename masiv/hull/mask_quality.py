@@ -70,8 +70,9 @@ def mask_quality(scene: Scene) -> MaskQuality:
 
 
 def hull_silhouette(hull: VisualHull, view: Silhouette) -> np.ndarray:
-    """The silhouette (H, W) float32 of ``hull`` in ``view``, each voxel drawn as the ball inside of it."""
-    pixels, depth = view.project(hull.points)
+    """The silhouette (H, W) float32 of ``hull`` in ``view``, each voxel drawn as the ball inside of it. Those on its
+    surface are drawn: they cover the others."""
+    pixels, depth = view.project(hull.points[hull.surface])
     radii = 0.5 * hull.spacing * view.camera.intrinsics[0, 0] / np.maximum(depth, 1e-6)
     drawn = np.zeros(view.distance.shape, np.uint8)
     fixed = np.rint((pixels - 0.5) * 16).astype(int)

@@ -4,35 +4,37 @@ from __future__ import annotations
 
 import numpy as np
 
-FEWEST_FRAMES = 5
+from masiv.identifiability.motion import FALL_FRAMES, acceleration
+
 MAX_ANGLE_DEG = 30.0
 """Between fall and gravity. Chosen: a wrong axis has 90°, a wind of half of gravity 27°."""
 MAX_FACTOR = 1.5
 """Between fall and gravity. Chosen: a frame rate that is wrong by a factor of 1.25 makes 1.56."""
 STANDARD_ERRORS = 5.0
+FEWEST_FLIGHT = 4
+MAX_NOISE = 3.0
+"""Times the noise that a parabola may leave."""
 
 
-def acceleration(times: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, float]:
-    """Acceleration (3,) [m/s²] of ``path`` (T, 3) [m] by least squares, and its standard error in one axis."""
-    t = times - times.mean()
-    basis = np.stack([np.ones_like(t), t, 0.5 * t**2], axis=1)
-    found, *_ = np.linalg.lstsq(basis, path, rcond=None)
-    left = path - basis @ found
-    variance = float((left**2).sum()) / (3 * (len(t) - 3))
-    return found[2], float(np.sqrt(variance * np.linalg.inv(basis.T @ basis)[2, 2]))
+def fall_problem(times: np.ndarray, path: np.ndarray, noise: float, gravity: np.ndarray) -> str | None:
+    """A sentence if the body flies at the beginning of ``path`` (T, 3) [m], known to ``noise`` [m], and does not fall
+    along ``gravity`` (3,) [m/s²].
 
-
-def fall_problem(times: np.ndarray, path: np.ndarray, gravity: np.ndarray) -> str | None:
-    """A sentence if the body flies at the beginning of ``path`` (T, 3) [m] and not along ``gravity`` (3,) [m/s²].
-
-    It flies over the first frames whose acceleration is constant: the most of ``FEWEST_FRAMES`` or more in which twice
-    the frames do not say otherwise, by the standard error.
+    It flies over the first frames, five or more, whose acceleration is constant within the noise and as large as
+    gravity. This takes no ground, which would be wrong with the axis.
     """
     strength = float(np.linalg.norm(gravity))
-    if strength == 0 or len(times) < FEWEST_FRAMES:
+    if strength == 0:
         return None
-    found = [acceleration(times[:n], path[:n]) for n in range(FEWEST_FRAMES, len(times) + 1)]
-    fall, error = min(found, key=lambda pair: pair[1])
+    found = None
+    for count in range(FALL_FRAMES, len(times) + 1):
+        fall, error, left = acceleration(times[:count], path[:count])
+        if left > MAX_NOISE * noise:
+            break
+        found = fall, error * max(1.0, noise / max(left, 1e-12))
+    if found is None:
+        return None
+    fall, error = found
     size = float(np.linalg.norm(fall))
     if size < STANDARD_ERRORS * error or size == 0:
         return None  # it rests, is held, or is not seen well enough
@@ -48,12 +50,14 @@ def fall_problem(times: np.ndarray, path: np.ndarray, gravity: np.ndarray) -> st
     return None
 
 
-def wrong_scale(times: np.ndarray, path: np.ndarray, gravity: np.ndarray) -> str | None:
-    """A sentence if ``path`` (T, 3) [m], all of it in flight, is along ``gravity`` but much faster or slower."""
+def wrong_scale(times: np.ndarray, path: np.ndarray, noise: float, gravity: np.ndarray) -> str | None:
+    """A sentence if ``path`` (T, 3) [m], all of it in flight and known to ``noise`` [m], is along ``gravity`` but much
+    faster or slower."""
     strength = float(np.linalg.norm(gravity))
-    if strength == 0 or len(times) < FEWEST_FRAMES:
+    if strength == 0 or len(times) < FEWEST_FLIGHT:
         return None
-    fall, error = acceleration(times, path)
+    fall, error, left = acceleration(times, path)
+    error *= max(1.0, noise / max(left, 1e-12))
     along = float(fall @ gravity) / strength
     across = float(np.linalg.norm(fall - along * gravity / strength))
     low, high = along - STANDARD_ERRORS * error, along + STANDARD_ERRORS * error
@@ -61,6 +65,6 @@ def wrong_scale(times: np.ndarray, path: np.ndarray, gravity: np.ndarray) -> str
         return None
     return (
         f"in flight the object accelerates by {along:.3g} ± {error:.2g} m/s² along gravity, which is {strength:.3g}: "
-        f"check fps (a factor of {np.sqrt(abs(strength / along)):.3g} would explain it), the unit of the poses, or gravity "
-        "in scene.yaml"
+        f"check fps (a factor of {np.sqrt(abs(strength / along)):.3g} would explain it), the unit of the poses, "
+        "or gravity in scene.yaml"
     )

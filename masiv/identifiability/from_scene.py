@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from masiv.errors import MasivError
 from masiv.hull.carve import visual_hull
@@ -16,8 +17,11 @@ SUBPIXEL = 0.1
 """Of a pixel: no centre and no length of an outline is known better."""
 
 
-def scene_motion(scene: Scene) -> ObservedMotion | None:
-    """The motion of the body of ``scene``; None if it is seen in fewer than three frames."""
+def scene_motion(scene: Scene, path: tuple[np.ndarray, np.ndarray] | None = None) -> ObservedMotion | None:
+    """The motion of the body of ``scene``; None if it is seen in fewer than three frames.
+
+    path: frames (K,) and the centre (K, 3) [m] in them, if it is known better than by the hulls of a few frames.
+    """
     observed = scene.observed_frames
     frames = sorted({observed[k] for k in np.linspace(0, len(observed) - 1, MAX_FRAMES).round().astype(int)})
     found, spacings = {}, []
@@ -25,6 +29,7 @@ def scene_motion(scene: Scene) -> ObservedMotion | None:
     for frame in frames:
         if scene.load_cloud is not None:
             found[frame] = scene.cloud(frame).points
+            volume = _hull_volume(found[frame]) if volume is None else volume
             continue
         try:
             hull = visual_hull(scene, frame, resolution=RESOLUTION)
@@ -38,9 +43,13 @@ def scene_motion(scene: Scene) -> ObservedMotion | None:
         return None
     clouds = [found[frame] for frame in kept]
     centre = np.stack([points.mean(axis=0) for points in clouds])
-    # Half-axes of the ellipsoid with the same second moments.
-    shape = np.stack([np.sqrt(5 * np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0)) for points in clouds])
     floor = SUBPIXEL * _pixel(scene, centre)
+    centre_std = noise_std(centre, floor)
+    if path is not None and set(kept) <= set(path[0].tolist()):
+        centre = path[1][np.searchsorted(path[0], kept)]
+        centre_std = noise_std(path[1], floor)
+    # Axes of the ellipsoid with the same second moments.
+    shape = np.stack([2 * np.sqrt(5 * np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0)) for points in clouds])
     lowest, height_std = None, floor
     if scene.ground is not None:
         half = 0.5 * spacings[0] if spacings else 0.0
@@ -50,12 +59,21 @@ def scene_motion(scene: Scene) -> ObservedMotion | None:
         # Even in a voxel.
         height_std = max(floor, float(np.median(spacings)) / 12**0.5 if spacings else floor)
     motion = ObservedMotion(
-        name=scene.path.name, times=np.array(kept) / scene.fps, centre=centre, centre_std=noise_std(centre, floor),
+        name=scene.path.name, times=np.array(kept) / scene.fps, centre=centre, centre_std=centre_std,
         shape=shape, shape_std=noise_std(shape, floor), lowest=lowest, height_std=height_std,
+        floor=floor,
         size=float(np.ptp(clouds[0], axis=0).max()), mass=None if volume is None else volume * scene.density,
         gravity=scene.gravity, normal=scene.up if scene.ground is None else scene.ground.normal,
     )  # fmt: skip
     return motion.with_flight_noise()
+
+
+def _hull_volume(points: np.ndarray) -> float | None:
+    """Of the convex hull [m³], an upper bound; None if the points are in one plane."""
+    try:
+        return float(ConvexHull(points).volume)
+    except QhullError:
+        return None
 
 
 def _pixel(scene: Scene, centre: np.ndarray) -> float:

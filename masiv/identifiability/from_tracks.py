@@ -18,7 +18,7 @@ FEWEST_FRAMES = 3
 def track_motion(tracks: Tracks, run: Run) -> ObservedMotion | None:
     """The motion of the body of ``run``; None if its markers are all seen in fewer than three frames."""
     moving, body = run.moving(), tracks.bodies[run.body]
-    chosen = body.free_markers(run) or tuple(np.flatnonzero(run.axes.any(axis=1)))
+    chosen = body.free_markers(run) or tuple(np.flatnonzero(run.axes.any(axis=1)).tolist())
     if len(chosen) > MOST_MARKERS:
         chosen = tuple(chosen[k] for k in np.linspace(0, len(chosen) - 1, MOST_MARKERS).round().astype(int))
     whole = moving.seen[:, list(chosen)].all(axis=1)
@@ -26,7 +26,7 @@ def track_motion(tracks: Tracks, run: Run) -> ObservedMotion | None:
         return None
     places = np.nan_to_num(moving.positions[whole][:, list(chosen)])
     times = moving.elapsed[whole]
-    measured = noise_std(places.reshape(len(places), -1), MIN_NOISE)
+    measured = noise_std(places[:, run.axes[list(chosen)]], MIN_NOISE)
     if run.noise_std is not None:
         measured = max(MIN_NOISE, float(np.sqrt(np.nanmean(run.noise_std[list(chosen)] ** 2))))
     clamped = body.clamp is not None

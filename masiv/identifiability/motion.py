@@ -13,6 +13,7 @@ NEAR_GROUND = 0.03
 """Of the body's size: outlines and the height of a real floor are not known better (chosen)."""
 
 FLIGHT_FRAMES = 3  # from which a standard deviation is taken
+FALL_FRAMES = 5  # … that of a parabola, with two degrees of freedom an axis
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class ObservedMotion:
     at one time. shape (T, K) [m]: lengths that a rigid motion leaves as they are (of a clamped body: distances from
     rest), K = 0 if the recording shows none. lowest (T,) [m]: height of the lowest point above the ground, None without
     ground. size [m]; mass [kg] or None; gravity (3,) [m/s²]; normal (3,): of the ground, or up. clamped: held, does not
-    fly. medium_density [kg/m³].
+    fly. medium_density [kg/m³]. floor [m]: no length is known better.
     """
 
     name: str
@@ -40,6 +41,7 @@ class ObservedMotion:
     normal: np.ndarray
     clamped: bool = False
     medium_density: float = 1.2
+    floor: float = 0.0
 
     @property
     def contact(self) -> int | None:
@@ -69,12 +71,25 @@ class ObservedMotion:
         return np.abs(off[:, np.argmax(np.abs(off).max(axis=0))])
 
     def with_flight_noise(self) -> ObservedMotion:
-        """With the noise of ``shape`` that the flight shows, in which a body keeps its shape, if that is larger: hulls
-        depend on how the body is turned."""
-        free = self.shape[self.flight]
-        if len(free) < FLIGHT_FRAMES or not self.shape.shape[1]:
-            return self
-        return replace(self, shape_std=max(self.shape_std, float(np.sqrt(free.var(axis=0, ddof=1).max()))))
+        """With the noise that the flight shows, in which a body keeps its shape, if that is larger (hulls depend on how
+        the body is turned), and what its parabola leaves of ``centre``."""
+        shape_std, centre_std = self.shape_std, self.centre_std
+        free = self.flight
+        if free.stop >= FLIGHT_FRAMES and self.shape.shape[1]:
+            shape_std = max(shape_std, float(np.sqrt(self.shape[free].var(axis=0, ddof=1).max())))
+        if free.stop >= FALL_FRAMES:
+            centre_std = max(self.floor, acceleration(self.times[free], self.centre[free])[2])
+        return replace(self, shape_std=shape_std, centre_std=centre_std)
+
+
+def acceleration(times: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Acceleration (3,) [m/s²] of ``path`` (T, 3) [m], T > 3, by least squares, its standard error in one axis, and the
+    standard deviation [m] of what is left."""
+    t = times - times.mean()
+    basis = np.stack([np.ones_like(t), t, 0.5 * t**2], axis=1)
+    found, *_ = np.linalg.lstsq(basis, path, rcond=None)
+    variance = float(((path - basis @ found) ** 2).sum()) / (3 * (len(t) - 3))
+    return found[2], float(np.sqrt(variance * np.linalg.inv(basis.T @ basis)[2, 2])), float(np.sqrt(variance))
 
 
 def noise_std(values: np.ndarray, floor: float) -> float:

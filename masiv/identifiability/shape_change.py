@@ -90,7 +90,7 @@ def _does_not_return(motion: ObservedMotion) -> str | None:
 
 
 def _peak(size: np.ndarray) -> int | None:
-    """The frame of the first maximum of ``size`` (T,) that is followed by a return of ``SPRUNG_BACK`` of the largest."""
+    """The frame of the first maximum of ``size`` (T,) from which ``SPRUNG_BACK`` of the largest goes back."""
     highest = np.maximum.accumulate(size)
     back = np.flatnonzero(highest - size > SPRUNG_BACK * highest.max())
     return int(size[: back[0]].argmax()) if len(back) else None

@@ -14,7 +14,7 @@ YES, DOUBTFUL = 3.0, 1.0
 
 @dataclass(frozen=True)
 class Answer:
-    """verdict: yes, doubtful or no. signal_mm: by how much ``change`` of the quantity would change the motion; noise_mm:
+    """verdict: yes, doubtful or no. signal_mm: by how much a change of the quantity would change the motion; noise_mm:
     its standard error; both None if the motion cannot show it. film: what to record instead, None for a yes."""
 
     quantity: str

@@ -83,7 +83,7 @@ def _mark_cloud(drawn: np.ndarray, scene: Scene, box: tuple[np.ndarray, float], 
     centre, size = box
     tile = len(drawn)
     if scene.ground is not None and scene.ground.normal @ scene.up > 0.999:
-        row = round(tile * (0.5 - (scene.ground.height - centre @ scene.up) / size))
+        row = round(tile * (0.5 - (scene.ground.height - float(centre @ scene.up)) / size))
         if 0 <= row < tile:
             drawn[row] = GRID
     long = round(tile * marks.length / size)
@@ -113,9 +113,10 @@ def _tile(scene: Scene, view: int, frame: int, width: int, marks: Marks | None) 
     image = cv2.resize(picture.image, (width, height), interpolation=inter)
     hidden = cv2.resize((~picture.valid).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     image[hidden] = (image[hidden] // 2 + np.array(HIDDEN, np.uint8) // 2).astype(np.uint8)
+    mask = cv2.resize(picture.mask, (width, height), interpolation=cv2.INTER_LINEAR)
     if marks is not None:
-        image = draw_world(image, scene.cameras[view], scene.up, scene.ground, marks.centre, marks.length)
-    tile = outlined(image, cv2.resize(picture.mask, (width, height), interpolation=cv2.INTER_LINEAR))
+        image = draw_world(image, scene.cameras[view], scene.up, scene.ground, marks.centre, marks.length, mask)
+    tile = outlined(image, mask)
     _write(tile, f"{view}:{frame}", (3, 11))
     return tile
 

@@ -9,9 +9,8 @@ import numpy as np
 
 from masiv.calibration.clocks import clocks, late_cameras
 from masiv.calibration.consistency import consistency, odd_camera, pairs_of, tangency_series
-from masiv.calibration.frontier import Outlines
 from masiv.calibration.mask_flicker import flicker, flickering_masks, hole_share
-from masiv.calibration.outline_points import ray_centres
+from masiv.calibration.outline_points import area_middles, ray_centres
 from masiv.calibration.tangency import Outline, outline
 from masiv.hull.first_frame import first_frame_problems
 from masiv.hull.mask_quality import mask_quality
@@ -44,9 +43,10 @@ def inspection(read: Scene | Tracks, picture: Path) -> tuple[dict[str, Any], str
         path, notes = _inspect_cameras(read, summary)
     first = first_frame_problems(read)
     summary["problems"] += first
-    motion = scene_motion(read)
+    motion = scene_motion(read, path)
     if motion is not None:
-        times, centre = (motion.times, motion.centre) if path is None else path
+        # Hulls are cut at the ground, which is wrong with the axis; rays are not.
+        times, centre = (motion.times, motion.centre) if path is None else (path[0] / read.fps, path[1])
         summary["problems"] += _fall_problems(motion, times, centre)
     marks = None if motion is None else Marks(motion.centre[0], round_length(0.5 * motion.size))
     write_contact_sheet(read, picture, notes, marks)
@@ -71,15 +71,17 @@ def _fall_problems(motion: ObservedMotion, times: np.ndarray, centre: np.ndarray
     """centre (T, 3) [m] at ``times`` (T,) [s], which may be more than those of ``motion``."""
     if motion.clamped:
         return []
-    wrong = fall_problem(times, centre, motion.gravity)
+    # The noise of a path by rays is known without the flight, which the ground cuts out.
+    noise = motion.centre_std if centre is motion.centre else motion.floor
+    wrong = fall_problem(times, centre, noise, motion.gravity)
     if wrong is None and motion.lowest is not None and motion.contact is not None:
         flies = times < motion.times[motion.contact]
-        wrong = wrong_scale(times[flies], centre[flies], motion.gravity)
+        wrong = wrong_scale(times[flies], centre[flies], noise, motion.gravity)
     return [] if wrong is None else [who + wrong]
 
 
 def _inspect_cameras(scene: Scene, summary: dict[str, Any]) -> tuple[tuple[np.ndarray, np.ndarray], dict[int, str]]:
-    """Numbers and problems of cameras and masks into ``summary``; times (T,) [s] and path (T, 3) [m] of the object, and
+    """Numbers and problems of cameras and masks into ``summary``; frames (K,) and path (K, 3) [m] of the object, and
     a note for each view."""
     cameras = [scene.cameras[view] for view in scene.views]
     outlines, holes = _outlines(scene)
@@ -99,13 +101,15 @@ def _inspect_cameras(scene: Scene, summary: dict[str, Any]) -> tuple[tuple[np.nd
         rows[view]["time_offset_ms"] = None if found is None else 1e3 * float(found.offsets[k])
         rows[view]["time_offset_error_ms"] = None if found is None else 1e3 * float(found.standard_errors[k])
         rows[view]["flickering_frames"] = list(flickers.frames[k])
-    late = {} if found is None else late_cameras(scene, found)
+    late = {} if found is None else late_cameras(scene, found, agreement)
     odd = None if agreement.suspect in late else odd_camera(scene, agreement)
     summary["problems"] += [*late.values(), *([] if odd is None else [odd])]
-    summary["problems"] += [*flickering_masks(scene, flickers), *quality.problems()]
-    frames, centres = ray_centres(cameras, Outlines.of(outlines, range(scene.frame_count)))
+    # At another time, or from another place, every mask disagrees.
+    summary["problems"] += flickering_masks(scene, flickers, {*late, agreement.suspect})
+    summary["problems"] += quality.problems()
+    frames, centres = ray_centres(cameras, area_middles(cameras, outlines))
     notes = {view: f"{error:.1f} px" for view, error in zip(agreement.views, agreement.pixels, strict=True)}
-    return (frames / scene.fps, centres), notes
+    return (frames, centres), notes
 
 
 def _outlines(scene: Scene) -> tuple[list[list[Outline | None]], np.ndarray]:

@@ -30,10 +30,17 @@ def ground_axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_world(
-    image: np.ndarray, camera: Camera, up: np.ndarray, ground: Ground | None, centre: np.ndarray, length: float
+    image: np.ndarray,
+    camera: Camera,
+    up: np.ndarray,
+    ground: Ground | None,
+    centre: np.ndarray,
+    length: float,
+    mask: np.ndarray,
 ) -> np.ndarray:
     """A copy of ``image`` (H, W, 3) RGB, of any size, with the grid of the ground under ``centre`` (3,) [m], its cells
-    ``length`` [m] wide, and an arrow of this length up from its foot (from ``centre`` without ground)."""
+    ``length`` [m] wide, and an arrow of this length up from its foot (from ``centre`` without ground). The
+    object, where ``mask`` (H, W) exceeds 0.5, hides the grid."""
     drawn = np.ascontiguousarray(image.copy())
     scale = np.array([image.shape[1] / camera.width, image.shape[0] / camera.height])
     near = NEAR * float(np.linalg.norm(camera.centre - centre))
@@ -49,12 +56,13 @@ def draw_world(
             for step in ends:
                 line = middle + step * across + np.outer([ends[0], ends[-1]], along)
                 _line(drawn, camera, line, near, scale, GRID, 1)
+        drawn[mask > 0.5] = image[mask > 0.5]
     _line(drawn, camera, np.stack([foot, foot + length * up]), near, scale, ARROW, 2, head=True)
     return drawn
 
 
 def clipped(camera: Camera, line: np.ndarray, near: float) -> np.ndarray | None:
-    """Pixels (2, 2) of the ends of ``line`` (2, 3) [m], cut off ``near`` [m] before the camera; None if it is behind."""
+    """Pixels (2, 2) of the ends of ``line`` (2, 3) [m], cut off ``near`` [m] before it; None if it is behind."""
     in_camera = line @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     depth = in_camera[:, 2]
     if (depth < near).all():

@@ -45,8 +45,8 @@ def _shutters(scene: Scene) -> dict[str, Any]:
 def summarise(scene: Scene) -> dict[str, Any]:
     """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem.
 
-    What compares the cameras is not known here: ``consistency_px``, ``mask_agreement``, ``mask_doubt``, the time offsets
-    and the frames that flicker.
+    What compares the cameras is not known here: ``consistency_px``, ``mask_agreement``, ``mask_doubt``, the
+    time offsets and the frames that flicker.
     """
     if scene.load_cloud is not None:
         return _summarise_clouds(scene)
