@@ -4,8 +4,9 @@
 
 A random convex body spins, falls and bounces before 3 to 11 cameras of 320 × 320 pixels, for 8 to 16 frames. The
 cameras have random errors of rotation, position and focal length, of a standard deviation between 0.01° and 0.5° (and
-as many percent of a metre, and percent). Clocks and masks are right. Printed are quantiles over the recordings of the largest
-clock offset in standard errors, in frames and in pixels, and of the largest outline error over the usual one.
+as many percent of a metre, and percent). Clocks and masks are right. Printed are quantiles (50, 95, 100 %) over the
+recordings of the largest clock offset in standard errors, in frames and in pixels, and of the largest outline error
+over the usual one, and how many recordings have a mask that is said to flicker.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ def row(scene: Scene, fault: str) -> str:
     hits = [problem for problem in problems if expected is not None and re.search(expected, problem)]
     others = [problem for problem in problems if problem not in hits]
     found = "" if expected is None else "yes" if hits else "**no**"
-    say = "; ".join(hits).split(": ", 1)[-1].split(": correct")[0].split(": check")[0]
+    say = re.split(": (?:correct|check|synchronise)", re.sub(r"^view \d+ \([^)]*\): ", "", "; ".join(hits)))[0]
     verdicts = " ".join(
         f"{name[:5]} {answer['verdict']}"
         for name, answer in summary["identifiability"][0].items()

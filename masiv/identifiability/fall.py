@@ -40,7 +40,7 @@ def fall_problem(times: np.ndarray, path: np.ndarray, noise: float, gravity: np.
         return None  # it rests, is held, or is not seen well enough
     angle = float(np.degrees(np.arccos(np.clip(fall @ gravity / (size * strength), -1, 1))))
     way = ", ".join(f"{x:.1f}" for x in fall)
-    declared = ", ".join(f"{x:.1f}" for x in gravity)
+    declared = ", ".join(f"{x:.1f}" for x in gravity + 0.0)
     slack = STANDARD_ERRORS * error / strength
     if angle > MAX_ANGLE_DEG and abs(size / strength - 1) < 0.25 + slack:
         return (
