@@ -336,7 +336,9 @@ def test_commands_on_a_group(tmp_path, masiv):
         fall = saved["markers"][:, found["markers"].index("light"), 1]
         assert saved["positions"].shape == (20, 3, 3)
         np.testing.assert_allclose(np.diff(fall, 2) * 15**2, -1.6, atol=1e-6)
-    assert "observed and simulated motion" in (run / "report.html").read_text()
+    page = (run / "report.html").read_text()
+    assert "Motion of each recording" in page
+    assert "quadratic_drag (light)" in page
 
 
 def test_what_tracks_refuse(tmp_path, masiv):
