@@ -338,7 +338,7 @@ def test_commands_on_a_group(tmp_path, masiv):
         np.testing.assert_allclose(np.diff(fall, 2) * 15**2, -1.6, atol=1e-6)
     page = (run / "report.html").read_text()
     assert "Motion of each recording" in page
-    assert "quadratic_drag (light)" in page
+    assert "quadratic drag (light)" in page.lower()
 
 
 def test_what_tracks_refuse(tmp_path, masiv):
