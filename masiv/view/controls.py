@@ -140,11 +140,14 @@ class Controls:
         with self.gui.add_folder("Effects"):
             for effect in effects:
                 rows = [
-                    f"{name.replace('_', ' ')} {value:.4g}{'' if e is None else f' ± {e:.2g}'} {unit}"
+                    f"{name.replace('_', ' ')} {value:.4g}{'' if e is None else f' ± {e:.2g}'} "
+                    + ("" if unit == "1" else unit)
                     for name, value, unit, e in effect.rows()[:8]
                 ]
-                self.layers[f"effect {effect.name}"] = self.gui.add_checkbox(effect.name, True)
-                self.gui.add_markdown("; ".join(rows))
+                if (layer := f"effect {effect.name}") not in self.layers:  # one of several bodies has each its own
+                    self.layers[layer] = self.gui.add_checkbox(effect.name, True)
+                whose = f"{', '.join(effect.bodies)}: " if effect.bodies else ""
+                self.gui.add_markdown(whose + "; ".join(rows))
             self.arrows = self.gui.add_markdown("")
 
     def say_arrows(self, shown: Shown) -> None:

@@ -45,19 +45,27 @@ class Page:
         server.gui.set_panel_label(f"masiv: {subject.title}")
         self.nodes = Nodes(server.scene, subject)
         self.controls = Controls(server.gui, subject, self.draw, self.simulate)
+        self._aimed = False
         self._look_at_body()
         self.draw()
 
     def _look_at_body(self) -> None:
-        """Let the page open with the observed motion, or the body, before it."""
+        """Let the page open with the observed motion, or the body, before it. Points in flight that were not observed
+        in space are found when they have been simulated."""
         subject = self.subject
         points = subject.observed
         if points is None:
             particles = [body.particles for body in subject.twin.bodies if body.particles is not None]
-            points = particles[0][None] if particles else np.zeros((1, 1, 3))
+            if not particles:
+                return
+            points = particles[0][None]
+        self._look_at(points)
+
+    def _look_at(self, points: np.ndarray) -> None:
+        """Let the page open, and let those who look turn, so that ``points`` (T, N, 3) [m] are in view."""
         low, high = np.nanmin(points, (0, 1)), np.nanmax(points, (0, 1))
         middle, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 0.5 * self.nodes.size)
-        up = subject.twin.up / np.linalg.norm(subject.twin.up)
+        up = self.subject.twin.up / np.linalg.norm(self.subject.twin.up)
         side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
         side /= np.linalg.norm(side)
         place = middle + 3.0 * radius * (0.8 * side + 0.5 * np.cross(side, up) + 0.35 * up)
@@ -65,6 +73,10 @@ class Page:
         initial = self.server.initial_camera
         initial.position, initial.look_at, initial.fov = tuple(camera.centre), tuple(middle), 0.9
         initial.near, initial.far = 0.01 * radius, 200 * radius
+        self._aimed = True
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at = tuple(camera.centre), tuple(middle)
+            client.camera.near, client.camera.far = initial.near, initial.far
 
     def draw(self) -> None:
         """Bring the scene to what the widgets say."""
@@ -84,6 +96,9 @@ class Page:
     def _finished(self, variation: Variation, rollout: Rollout) -> None:
         with self._lock:
             self.shown = Shown(self.subject, rollout)
+            if not self._aimed:
+                self.nodes.size = self.shown.size
+                self._look_at(rollout.positions)
             self.controls.show(self.shown)
             self.controls.say_arrows(self.shown)
         changed = "as identified" if variation == Variation() else "with the values of the sliders"
