@@ -72,6 +72,14 @@ def test_exact_clocks_are_not_blamed_nor_is_a_camera_that_is_turned():
     assert late_cameras(scene, clocks_of(scene), silhouette_consistency(scene)) == {}
 
 
+@pytest.mark.parametrize("seen", [0, 1])
+def test_masks_without_an_outline_say_nothing_about_clocks(seen):
+    """Masks that are empty or cover the picture, of all cameras, or of all but one."""
+    rows = outlines_of(recording())
+    without = [row if view < seen else [None] * FRAMES for view, row in enumerate(rows)]
+    assert clocks(tuple(range(len(CAMERAS))), CAMERAS, without, FPS) is None
+
+
 def test_a_recording_that_is_too_short_says_nothing_about_clocks():
     assert clocks_of(dataclasses.replace(recording(), frame_count=3)) is None
 

@@ -65,7 +65,7 @@ def clocks(
     None if the recording is too short or the cameras never see a common tangent plane.
     """
     count = len(outlines[0]) if outlines else 0
-    if len(cameras) < 2 or count < FEWEST_FRAMES:
+    if count < FEWEST_FRAMES or _cameras_with_outlines(outlines) < 2:
         return None
     found = half_frames(cameras, outlines)
     fit: SilhouetteFit | None = None
@@ -75,6 +75,8 @@ def clocks(
         if len(frames) < FEWEST_FRAMES:
             return None
         moved = [[row[f - shift] for f in frames] for row, shift in zip(outlines, shifts, strict=True)]
+        if _cameras_with_outlines(moved) < 2:
+            return None
         rest = (found - shifts) / fps
         fit = fit_silhouettes(cameras, moved, frames, fps, BROAD_PRIOR, rest)
         if fit is None:
@@ -87,6 +89,11 @@ def clocks(
     found = found / fps
     moves = _speeds_px(cameras, outlines, fps, fit) * np.abs(found)
     return Clocks(views, found, np.maximum(fit.clock_errors, 1e-12), moves)
+
+
+def _cameras_with_outlines(outlines: Sequence[Sequence[Outline | None]]) -> int:
+    """How many cameras have an outline at any frame: a mask that is empty, or covers the picture, has none."""
+    return sum(any(outline is not None for outline in row) for row in outlines)
 
 
 def late_cameras(scene: Scene, found: Clocks, agreement: Consistency) -> dict[int, str]:
