@@ -11,10 +11,10 @@ from masiv.errors import InputError
 from masiv.report import history, measure
 from masiv.report.draw import backdrop, draw
 from masiv.report.follow import Binding
-from masiv.report.library import packed_library
 from masiv.report.media import write_png, write_video
 from masiv.report.numbers import rows, table
 from masiv.report.page import Page, number
+from masiv.report.plotly_script import packed_script
 from masiv.report.time_charts import convergence, over_time
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Ground
@@ -118,7 +118,7 @@ def test_page_is_self_contained_and_escapes(tmp_path):
     assert "(0.5, 2)" in text
     assert "<b>" not in text
     scripts = text[text.index('<script type="application/json"') :]
-    assert "http" not in text.replace(packed_library(), "")
+    assert "http" not in text.replace(packed_script(), "")
     assert scripts.count("</script>") == 3  # data, library, report.js: none ends early
     assert number(float("inf")) == "∞"
 

@@ -23,9 +23,9 @@ from masiv.identification.from_tracks import described_twin
 from masiv.observations.read import read_scene
 from masiv.pipeline import stages
 from masiv.report import camera_view, motion_view
-from masiv.report.library import packed_library
 from masiv.report.motion_view import Motion, motion_data
 from masiv.report.numbers import run_numbers
+from masiv.report.plotly_script import packed_script
 from masiv.report.tracks import write_report as write_report_of_tracks
 from masiv.report.video import write_report
 from masiv.runfolder import RunFolder
@@ -111,8 +111,8 @@ def picture_of(page, selector: str) -> np.ndarray:
 def test_one_small_file_that_needs_no_other(report):
     text = report.read_text(encoding="utf-8")
     assert report.stat().st_size < MAX_BYTES
-    assert packed_library() in text
-    rest = text.replace(packed_library(), "")
+    assert packed_script() in text
+    rest = text.replace(packed_script(), "")
     assert re.findall(r"https?://", rest) == []
     assert [
         source[:5] for source in re.findall(r'(?:src|href)="([^"]*)"', rest) if not source.startswith("data:")
@@ -122,7 +122,7 @@ def test_one_small_file_that_needs_no_other(report):
 def test_the_largest_page_is_below_the_limit():
     """The library and the most that views may take, with 1.2 MB for everything else."""
     views = 4 / 3 * (motion_view.MAX_BYTES + camera_view.MAX_BYTES)
-    assert len(packed_library()) + views + 1_200_000 < MAX_BYTES
+    assert len(packed_script()) + views + 1_200_000 < MAX_BYTES
 
 
 def test_the_answer_comes_first_and_settings_last(report):

@@ -138,11 +138,11 @@ class Page:
         """Nothing for a page without charts."""
         if not self.data:
             return ""
-        from masiv.report.library import packed_library
+        from masiv.report.plotly_script import packed_script
 
         return (
             f'{NO_SCRIPT}<script type="application/json" id="data">{as_json(self.data)}</script>'
-            f'<script type="text/plain" id="library">{packed_library()}</script><script>{_web("report.js")}</script>'
+            f'<script type="text/plain" id="library">{packed_script()}</script><script>{_web("report.js")}</script>'
         )
 
 

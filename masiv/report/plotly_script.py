@@ -12,7 +12,7 @@ from functools import cache
 
 
 @cache
-def packed_library() -> str:
+def packed_script() -> str:
     """The script, gzip, base64."""
     from plotly.offline import get_plotlyjs
 
