@@ -10,10 +10,11 @@ from masiv.identifiability.verdict import YES, Answer, mm, no, velocity_at_conta
 FRICTION, REBOUND = 0.5, 0.5
 """Typical coefficients of friction and of restitution."""
 FEWEST_AFTER = 3
+"""Frames after the contact, at the least, from which a change of velocity is seen: two give one velocity. Chosen."""
 SOFT = 0.05
-"""Of its size: a body that deforms by more is no rigid one that rebounds."""
+"""Of its size: a body that deforms by more is no rigid one that rebounds. Chosen."""
 STUCK = 0.1
-"""Part of its sideways speed below which a body stands."""
+"""Part of its sideways speed below which a body stands. Chosen."""
 FALL = "a fall on the ground"
 
 
