@@ -4,6 +4,7 @@
     python benchmarks/measured.py balls [--json FILE]
     python benchmarks/measured.py damping --particles 400 1000 1728 --youngs 310e3 --viscosity 250
     python benchmarks/measured.py load --youngs 306.4e3 --viscosity 203
+    python benchmarks/measured.py creep --duration 3.5 --particles 400 [--held-straight]
 
 The measurements are in the folder that MASIV_MEASURED names, ../shared/measured beside the repository by default. They
 are public: see benchmarks/measured.md.
@@ -68,7 +69,7 @@ def write_balls(source: Path, out: Path) -> Path:
     return out
 
 
-def write_beam(source: Path, out: Path) -> Path:
+def write_beam(source: Path, out: Path, held_straight: bool = True) -> Path:
     """A scene of the silicone beam in ``source``: _a is fitted, _b held out, under its own weight and with a load."""
     out.mkdir(parents=True, exist_ok=True)
     _link(source / "beam.stl", out)
@@ -79,7 +80,8 @@ def write_beam(source: Path, out: Path) -> Path:
             name = f"beam_{kind}_V2_{repeat}.csv"
             _link(source / name, out)
             runs.append({"file": name, "name": f"{kind}_{repeat}", "condition": condition, "use": use,
-                         "rest_frames": BEAM_AT_REST[kind, repeat], **ignored})  # fmt: skip
+                         "rest_frames": BEAM_AT_REST[kind, repeat], "held_straight": held_straight,
+                         **ignored})  # fmt: skip
     body = {
         "density": 1070,
         "poissons_ratio": 0.499,
@@ -242,6 +244,67 @@ def load(source: Path, youngs: float, viscosity: float, particles: int, courant:
     return rows
 
 
+def creep(source: Path, particles: int, courant: float, duration: float, youngs: float, held_straight: bool) -> dict:
+    """Law with Maxwell branches from gravity_a alone, over ``duration`` [s] after its release, from two starts with
+    the modulus ``youngs`` [Pa] at the frequency of its swing; with it, the mass at the middle of the end of the loaded
+    beam from load52_a. gravity_b and load52_b are held out. moduli: of uniaxial tension, three times those of shear."""
+    import torch
+
+    from masiv.effects.relaxation import BRANCHES, TIMES, shear_moduli
+    from masiv.identification.tracks import clamped_body_model
+    from masiv.inference.model_fit import gauss_newton_fit
+    from masiv.models.base import Model
+    from masiv.models.families import family_of
+    from masiv.mpm.config import SimulatorConfig
+    from masiv.tracks.config import TracksConfig
+    from masiv.tracks.read import read_tracks
+
+    with tempfile.TemporaryDirectory() as folder:
+        tracks = read_tracks(write_beam(source, Path(folder), held_straight))
+    known = {"poissons_ratio": 0.45}
+    config = SimulatorConfig.model_validate({"courant_number": courant, "max_substeps_per_frame": 4000})
+    settings = TracksConfig(particles=particles, duration=duration)
+    family = family_of("neo_hookean", 1070, known)
+    names = [f"relaxation.fraction_{i + 1}" for i in range(BRANCHES)]
+    names += [f"relaxation.time_{i + 1}" for i in range(BRANCHES)]
+
+    def row(began: float, simulation, fitted) -> dict:
+        out = {
+            "fit_mm": fitted.fit_mm, "held_out_mm": fitted.validation_mm,
+            "values": {n: [v, fitted.stderr.get(n)] for n, v in fitted.values.items()},
+            "rollouts": simulation.rollouts, "seconds": time.perf_counter() - began,
+        }  # fmt: skip
+        print(json.dumps(out), flush=True)
+        return out
+
+    fits, rows = [], []
+    swing = 2 * math.pi * 7.77  # of gravity_a [rad/s], at which the law alone has the modulus ``youngs``
+    for fraction in (0.1, 0.2):
+        began = time.perf_counter()
+        simulation = clamped_body_model(tracks, "", settings, config, known=known)
+        start = dict(zip(names, [fraction] * BRANCHES + list(TIMES), strict=True))
+        start["youngs_modulus"] = youngs / (1 + sum(fraction / (1 + (swing * t) ** -2) for t in TIMES))
+        fits.append(gauss_newton_fit(simulation, Model(family, "none", ("relaxation",)), start, budget=120))
+        rows.append(row(began, simulation, fits[-1]))
+    law = min(fits, key=lambda fitted: fitted.fit_mm)
+    found: dict = {"gravity": rows, "moduli": []}
+    theta = torch.tensor([law.values[n] for n in names], dtype=torch.float64)
+    shear = law.values["youngs_modulus"] / (2 * (1 + known["poissons_ratio"]))
+    frequencies = torch.tensor([0.03, 0.1, 0.3, 1.0, 3.0, 4.3, 7.8, 10.0], dtype=torch.float64)
+    for hz, storage, loss in zip(frequencies.tolist(), *shear_moduli(theta, shear, frequencies), strict=True):
+        found["moduli"].append({"hz": hz, "storage_pa": 3 * float(storage), "loss_pa": 3 * float(loss)})
+        print(json.dumps(found["moduli"][-1]), flush=True)
+
+    began = time.perf_counter()
+    given = known | {n: law.values[n] for n in ("youngs_modulus", *names)}
+    simulation = clamped_body_model(tracks, "load52", settings, config, known=given)
+    place = max(simulation.term("point_mass").guesses, key=lambda guess: guess[2])  # along the body, from the clamp
+    at = dict(zip((f"point_mass.{axis}" for axis in "xyz"), place, strict=True))
+    model = Model(family_of("neo_hookean", 1070, given), "none", ("relaxation", "point_mass"))
+    load = gauss_newton_fit(simulation, model, {"point_mass.mass": 0.03, **at}, budget=60, held=frozenset(at))
+    return found | {"load52": row(began, simulation, load)}
+
+
 def _held(simulation, trials: dict, name: str) -> dict | None:
     if name not in trials:
         return None
@@ -251,7 +314,7 @@ def _held(simulation, trials: dict, name: str) -> dict | None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="?", default="balls", choices=["scenes", "balls", "damping", "load"])
+    parser.add_argument("what", nargs="?", default="balls", choices=["scenes", "balls", "damping", "load", "creep"])
     parser.add_argument("--out", type=Path, default=Path("measured_scenes"))
     parser.add_argument("--json", type=Path)
     parser.add_argument("--particles", type=int, nargs="+", default=[400, 1000])
@@ -259,6 +322,7 @@ def main() -> None:
     parser.add_argument("--viscosity", type=float, default=250.0, help="[Pa s]")
     parser.add_argument("--duration", type=float, default=0.6, help="[s]")
     parser.add_argument("--courant", type=float, default=0.6)
+    parser.add_argument("--held-straight", action="store_true", help="of creep: the shape before the release is known")
     parser.add_argument("--effects", nargs="+", default=["point_mass", "point_force"], help="of load")
     asked = parser.parse_args()
     source = data_folder()
@@ -282,6 +346,15 @@ def main() -> None:
     elif asked.what == "load":
         found = load(
             source / "silicone_beam", asked.youngs, asked.viscosity, asked.particles[0], asked.courant, asked.effects
+        )
+    elif asked.what == "creep":
+        found = creep(
+            source / "silicone_beam",
+            asked.particles[0],
+            asked.courant,
+            asked.duration,
+            asked.youngs,
+            asked.held_straight,
         )
     else:
         found = balls(source / "ball_drops")

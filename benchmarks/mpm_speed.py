@@ -1,7 +1,7 @@
 """Speed of the simulator: million particle-substeps a second, forward and forward + backward, and that of plain Taichi
 autodiff.
 
-    python benchmarks/mpm_speed.py [--arch cpu] [--quick] > benchmarks/mpm_speed.md
+    python benchmarks/mpm_speed.py [--arch cpu] [--particles 1000,5000] [--laws "neo_hookean;neural"]
 
 Cold compile is timed in new processes with Taichi's offline cache switched to an empty folder, warm with that folder
 filled. Peak memory is the process's high-water mark. Each row is the median of repeats in one process; compare rows of
@@ -21,8 +21,13 @@ import sys
 import tempfile
 import time
 
-SIDE, DT, STEPS = 0.5, 2e-4, 100
+SIDE, DT = 0.5, 2e-4
 DRAG = "neo_hookean, linear drag"
+
+
+def substeps(count):
+    """Of a rollout: fewer of many particles, so that all states fit into memory."""
+    return 100 if count <= 50_000 else 20
 
 
 def body(count):
@@ -52,9 +57,10 @@ def time_masiv(law_name, count, repeats, arch):
     law = ClassicalLaw("neo_hookean", youngs_modulus=1e5, poissons_ratio=0.3)
     if law_name == "neural":
         law = load_law(pretrained_path("jelly"))
-    spacing = (6 * SIDE**3 / count) ** (1 / 3)
+    spacing, steps = (6 * SIDE**3 / count) ** (1 / 3), substeps(count)
     simulator = Simulator(particle_count=count, spacing=spacing, substep=DT, volume=SIDE**3, density=1e3,
-                          gravity=(0, -9.8, 0), max_substeps=STEPS, grid_nodes=1 << 18)  # fmt: skip
+                          gravity=(0, -9.8, 0), max_substeps=steps, memory_mb=8000,
+                          grid_nodes=max(1 << 18, count))  # fmt: skip
     x = body(count).requires_grad_()
     if law_name == DRAG:
         from masiv.effects.active import ActiveEffects
@@ -62,7 +68,7 @@ def time_masiv(law_name, count, repeats, arch):
         from masiv.effects.context import EffectContext
 
         gravity = torch.tensor([0.0, -9.8, 0.0])
-        context = EffectContext(gravity, x.detach(), 1e3 * SIDE**3 / count, SIDE, STEPS * DT, DT)
+        context = EffectContext(gravity, x.detach(), 1e3 * SIDE**3 / count, SIDE, steps * DT, DT)
         effects = ActiveEffects(((effect_named("linear_drag"), torch.tensor([0.5])),), context)
     velocity = torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
     still = torch.zeros(count, 3, 3)
@@ -71,7 +77,7 @@ def time_masiv(law_name, count, repeats, arch):
     forward, both = [], []
     for _ in range(repeats):
         start = time.perf_counter()
-        end = rollout(simulator, law, at_rest(x, velocity, still), STEPS, [STEPS], effects)
+        end = rollout(simulator, law, at_rest(x, velocity, still), steps, [steps], effects)
         middle = time.perf_counter()
         end.square().sum().backward()
         forward.append(middle - start)
@@ -91,7 +97,7 @@ def time_plain(count, repeats, arch):
     spacing = (6 * SIDE**3 / count) ** (1 / 3)
     x = body(count).numpy() + 4 * spacing
     cells = int((SIDE + 0.1) / spacing) + 12
-    steps = STEPS if count < 20000 else 20
+    steps = 100 if count < 20000 else 20
     sim = PlainMpm(count, steps, cells, spacing, DT, 1e3 * SIDE**3 / count, SIDE**3 / count, 38462.0, 57692.0)
 
     @ti.kernel
@@ -110,9 +116,11 @@ def time_plain(count, repeats, arch):
     for _ in range(repeats):
         start = time.perf_counter()
         sim.forward()
+        ti.sync()  # launches on a GPU return before they end
         middle = time.perf_counter()
         sim.backward()
-        scale = STEPS / steps
+        ti.sync()
+        scale = substeps(count) / steps
         forward.append((middle - start) * scale)
         both.append((time.perf_counter() - start) * scale)
     return first, forward, both
@@ -131,9 +139,11 @@ def worker(kind, count, repeats, arch):
     first, forward, both = (
         time_plain(count, repeats, arch) if kind == "plain" else time_masiv(kind, count, repeats, arch)
     )
-    rate = 1e-6 * count * STEPS
+    rate = 1e-6 * count * substeps(count)
     spread = (max(forward) - min(forward)) / statistics.median(forward)
     print(json.dumps({
+        "kind": kind,
+        "count": count,
         "first_s": first,
         "forward": rate / statistics.median(forward),
         "both": rate / statistics.median(both),
@@ -155,7 +165,8 @@ def measure(kind, count, repeats, arch, cache):
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--arch", default="cpu")
-    parser.add_argument("--quick", action="store_true", help="5,000 particles only")
+    parser.add_argument("--particles", default="1000,1500,5000,50000")
+    parser.add_argument("--laws", default=f"neo_hookean;{DRAG};neural;plain", help="separated by ;")
     parser.add_argument("--worker", nargs=3)
     options = parser.parse_args()
     if options.worker:
@@ -166,14 +177,14 @@ def main():
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
     ).stdout.strip()
     print("# Speed of the simulator\n")
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, `--arch {options.arch}`, float32, {STEPS} substeps"
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, `--arch {options.arch}`, float32, 100 substeps"
     print(f"{datetime.date.today()}, commit {commit}, {machine}.\n`python benchmarks/mpm_speed.py`\n")
     print("Million particle-substeps a second: median of repeats, and the spread of the forward pass. First call: from")
     print("starting Taichi to the first gradient, with an empty and with a filled kernel cache.\n")
     print("| law | particles | forward | forward + backward | spread | first call, cold | warm | peak memory |")
     print("|---|---|---|---|---|---|---|---|")
-    for count in (5000,) if options.quick else (1000, 1500, 5000, 50000):
-        for kind in ("neo_hookean", DRAG, "neural", "plain"):
+    for count in map(int, options.particles.split(",")):
+        for kind in options.laws.split(";"):
             repeats = 9 if count < 20000 else 3
             with tempfile.TemporaryDirectory() as cache:
                 cold = measure(kind, count, 1, options.arch, cache)

@@ -1,7 +1,7 @@
 """What a rough recording costs: scenes with ground truth, filmed worse.
 
 usage: python benchmarks/recordings.py OUT --scenes SCENE … [--cameras 11 4] [--jobs 2]
-                                       [--faults none calibration pictures all]
+                                       [--faults none calibration pictures all] [--law neural]
        python benchmarks/recordings.py OUT --table
 
 SCENE: a folder in the PAC-NeRF layout with gt/particles_F.npy. Faults: `calibration`: each camera is off by 0.15° about
@@ -72,9 +72,9 @@ def _camera_error(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, flo
     return rotation, rng.normal(0, 2e-3, 3), 1 + float(rng.normal(0, 0.003))
 
 
-def run(scene: Path, out: Path, cameras: int, faults: str, processes: int) -> None:
+def run(scene: Path, out: Path, cameras: int, faults: str, law: str, processes: int) -> None:
     """Make the case, identify it and evaluate it; finished stages are kept. processes: of a job (0: all cores)."""
-    case = out / f"{scene.name}.{cameras}.{faults}"
+    case = out / f"{scene.name}.{cameras}.{faults}{'' if law == 'neural' else f'-{law}'}"
     data, folder = case / "scene", case / "run"
     if not (data / "all_data.json").is_file():
         shutil.rmtree(data, ignore_errors=True)
@@ -82,7 +82,7 @@ def run(scene: Path, out: Path, cameras: int, faults: str, processes: int) -> No
     masiv = [sys.executable, "-m", "masiv.cli.main"]
     config = case / "processes.yaml"
     config.write_text(f"reconstruct: {{processes: {processes}}}\nidentify: {{processes: {processes}}}\n")
-    arguments = ["--out", str(folder), "--preset", "quick", "--fit-frames", "12", "--config", str(config)]
+    arguments = ["--out", str(folder), "--preset", "quick", "--fit-frames", "12", "--law", law, "--config", str(config)]
     with (case / "log.txt").open("a") as log:
         for command in (["identify", str(data), *arguments], ["evaluate", str(folder), "--truth", str(scene / "gt")]):
             done = subprocess.run([*masiv, *command], stdout=log, stderr=subprocess.STDOUT)
@@ -120,10 +120,11 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, nargs="*", default=[])
     parser.add_argument("--cameras", type=int, nargs="*", default=[11, 4])
     parser.add_argument("--faults", choices=FAULTS, nargs="*", default=list(FAULTS))
+    parser.add_argument("--law", default="neural")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--table", action="store_true")
     given = parser.parse_args()
-    cases = [(s, given.out, c, f) for s in given.scenes for c in given.cameras for f in given.faults]
+    cases = [(s, given.out, c, f, given.law) for s in given.scenes for c in given.cameras for f in given.faults]
     processes = 1 if given.jobs > 1 else 0
     with ThreadPoolExecutor(given.jobs) as pool:
         for _ in pool.map(lambda case: run(*case, processes), cases):

@@ -10,6 +10,7 @@ import typer
 import masiv
 
 from . import console
+from .batch import batch
 from .config import config
 from .evaluate import evaluate
 from .export import export
@@ -33,7 +34,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _JOBS = identify, inspect, reconstruct, trajectory, refine, simulate, evaluate
-for function in (*_JOBS, view, export, pretrain, synth, config):
+for function in (*_JOBS, batch, view, export, pretrain, synth, config):
     app.command()(console.command(function))
 app.command("import")(console.command(import_footage))
 

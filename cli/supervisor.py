@@ -29,9 +29,12 @@ class Interrupted(BaseException):
     """A signal asks the command to end. Typer would keep a KeyboardInterrupt to itself."""
 
 
-def run() -> None:
-    """The entry point of ``masiv``. Exit code of the command; 128 + the signal that ended it."""
+def run(started_by: int | None = None) -> None:
+    """The entry point of ``masiv``. Exit code of the command; 128 + the signal that ended it. started_by: a process
+    with which this one is to end."""
     if not hasattr(os, "fork"):
+        if started_by is not None:
+            end_with_parent(started_by)
         code = _command()
         if code:
             _say(code - 128)
@@ -41,6 +44,9 @@ def run() -> None:
     parent = os.getpid()
     child = os.fork()
     if child:
+        # Only now: a thread that loads a library while this process forks leaves the loader locked in the child.
+        if started_by is not None:
+            end_with_parent(started_by)
         sys.exit(_supervised(child))
     os.close(alive)
     end_with_parent(parent, lambda: os.read(watched, 1))

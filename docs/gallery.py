@@ -47,12 +47,16 @@ DROP = {"centre": (0.0, 0.7, 0.0), "velocity": (0.0, 0.0, 0.0), "omega": (0.0, 0
 JELLY = {"law": {"youngs_modulus": 7e3, "poissons_ratio": 0.35}}
 SLIDE = {"centre": (-0.5, 0.24, 0.0), "velocity": (1.1, 0.0, 0.0), "omega": (0.0, 0.0, 0.0)}
 SHOWN = {
+    "anisotropy": Show({"fibre_modulus": 6e4, "inclination_x": 0.0, "inclination_z": 0.0}, **DROP, **JELLY),
     "body_force": Show({"acceleration_x": -1.3, "acceleration_y": 0.0, "acceleration_z": 0.5}),
+    "drag_crisis": Show({"coefficient_below": 2.5, "coefficient_above": 0.2, "critical_speed": 1.0}),
     "gravity_scale": Show({"relative_change": -0.5}),
     "ground_friction": Show({"slipperiness": 20.0}, **SLIDE),
     "ground_height": Show({"height": 0.2}, **DROP),
     "hidden_obstacle": Show({"radius": 0.13, "x": 0.1, "y": 0.2, "z": 0.0}, **DROP),
+    "internal_pressure": Show({"pressure": 1.5e4}, **DROP),
     "linear_drag": Show({"rate": 3.0}),
+    "magnus": Show({"lift_rate_x": 0.0, "lift_rate_y": -2.5, "lift_rate_z": 0.0}, omega=(0.0, -8.0, 0.0)),
     "periodic_force": Show(
         {"cosine_x": 12.0, "cosine_y": 0.0, "cosine_z": 0.0, "sine_x": 0.0, "sine_y": 0.0, "sine_z": 0.0,
          "frequency": 2.0}, (0.0, 0.45, 0.0), (0.0, 2.6, 0.0), (0.0, 0.0, 0.0),
@@ -60,9 +64,17 @@ SHOWN = {
     "point_force": Show({"force_x": 0.0, "force_y": 200.0, "force_z": 0.0, "x": -0.6, "y": 0.7, "z": 0.0}),
     "point_mass": Show({"mass": 25.0, "x": 0.2, "y": 0.7, "z": 0.0}, **DROP),
     "quadratic_drag": Show({"coefficient": 2.0}),
+    "relaxation": Show(
+        {"fraction_1": 1.0, "fraction_2": 1.0, "fraction_3": 0.0, "time_1": 0.02, "time_2": 0.1, "time_3": 1.0},
+        **DROP, **JELLY,
+    ),
     "restitution": Show({"coefficient": 0.8}, **DROP),
     "stiffness_contrast": Show(
         {"log_stiffness_ratio": 2.0, "x": -0.15, "y": 0.52, "z": 0.1, "radius": 0.2}, **DROP, **JELLY
+    ),
+    "stiffness_contrast_half_space": Show(
+        {"log_stiffness_ratio": 2.5, "inclination_x": 1.571, "inclination_z": 0.0, "offset": 0.0, "width": 0.03},
+        **DROP, **JELLY,
     ),
     "swirl": Show({"strength": 6.0, "x": 0.0, "z": -0.2}, (-0.15, 0.6, -0.2), (0.0, 1.5, 0.0), (0.0, 0.0, 0.0)),
     "time_offset": Show({"delay": 0.1}),

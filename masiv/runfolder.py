@@ -338,7 +338,7 @@ def _with_defaults(config: Mapping[str, Any]) -> dict[str, Any]:
 def _differences(name: str, old: Any, new: Any) -> list[str]:
     if isinstance(old, dict) and isinstance(new, dict):
         return [d for key in {**old, **new} for d in _differences(f"{name}.{key}", old.get(key), new.get(key))]
-    unchanged = old == new or name.endswith(".processes")  # which leave every number as it is
+    unchanged = old == new or name.endswith((".processes", ".scheduler"))  # which leave every number as it is
     return [] if unchanged else [f"{name} {old!r} → {new!r}"]
 
 

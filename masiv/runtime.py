@@ -15,6 +15,10 @@ from typing import Any
 from masiv.errors import InputError
 
 _started: str | None = None
+ONE_THREAD: dict[str, str] = dict.fromkeys(
+    ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
+"""Environment variables that limit a process to one thread, if they are set before torch and Taichi are imported."""
 
 
 def silence() -> None:
@@ -53,6 +57,16 @@ def start(arch: str = "cpu") -> Any:
     return ti
 
 
+def start_on_one_thread(arch: str) -> Any:
+    """Start Taichi and torch in this process, on one thread of a CPU. Returns the ``taichi`` module."""
+    os.environ.update(ONE_THREAD)
+    import torch
+
+    ti = start(arch)
+    torch.set_num_threads(1)
+    return ti
+
+
 def _taichi_config() -> Any:
     from taichi.lang import impl
 
@@ -77,6 +91,12 @@ def adjoint(kernel: Any, *arguments: Any) -> None:
 def running_arch() -> str:
     """The arch that Taichi runs on; cpu if it has not been started."""
     return _started or "cpu"
+
+
+def check_float64(user: str) -> None:
+    """Raises InputError on Vulkan, whose exp, log and sin are of float32 only; user: what needs float64."""
+    if running_arch() == "vulkan":
+        raise InputError(f"{user} needs float64, which --arch vulkan lacks: use --arch cpu or cuda")
 
 
 def threads() -> int:

@@ -20,16 +20,15 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import resource_tracker, util
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from masiv import runtime
 from masiv.errors import InputError, MasivError
 from masiv.parent import end_with_parent
 
-ONE_THREAD: dict[str, str] = dict.fromkeys(
-    ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
-)
-"""Environment variables that limit a process to one thread, if they are set before torch and Taichi are imported."""
+if TYPE_CHECKING:
+    from masiv.dask_pool import DaskPool
+
 MAX_PROCESSES = 4
 
 
@@ -38,6 +37,17 @@ def process_count(asked: int) -> int:
     if runtime.running_arch() != "cpu":
         return 1
     return asked or min(runtime.threads(), MAX_PROCESSES)
+
+
+def workers_for(processes: int, scheduler: str, key: str = "refine.processes") -> Workers:
+    """A pool of as many processes as ``process_count`` says, or the workers of the Dask scheduler at the address
+    ``scheduler``, if it is not empty. key: see ``Workers``. Raises InputError if no scheduler answers there."""
+    if not scheduler:
+        return Workers(process_count(processes), key)
+    from masiv.dask_pool import DaskPool
+
+    pool = DaskPool(scheduler, runtime.running_arch())
+    return Workers(pool.workers, key, pool)
 
 
 class TaskError:
@@ -56,7 +66,8 @@ def unwrap(result: Any) -> Any:
 
 
 class Workers:
-    """A pool of ``processes`` that run tasks; with 1, tasks run in this process.
+    """A pool of ``processes`` that run tasks; with 1, tasks run in this process. With a ``dask_pool`` they are the
+    workers of a cluster, and all tasks run there.
 
     Use as a context. The processes start with the first task. If the block raises, they are terminated at once, and if
     this process is killed, they end, too; Ctrl-C reaches this process alone. key: of the configuration, that sets their
@@ -64,9 +75,10 @@ class Workers:
     ``multiprocessing``.
     """
 
-    def __init__(self, processes: int = 1, key: str = "refine.processes") -> None:
+    def __init__(self, processes: int = 1, key: str = "refine.processes", dask_pool: DaskPool | None = None) -> None:
         self.processes = processes
         self.key = key
+        self._dask = dask_pool
         self._pool: ProcessPoolExecutor | None = None
         self._started: set[Any] = set()
 
@@ -78,6 +90,8 @@ class Workers:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._dask is not None:
+            self._dask.close()
         if self._pool is None:
             return
         if kind is not None:
@@ -88,7 +102,7 @@ class Workers:
 
     def start(self) -> None:
         """Start the processes, if there are several, and return at once: they need seconds until the first task."""
-        if self.processes > 1:
+        if self.processes > 1 and self._dask is None:
             self._running()
 
     def map(self, function: Callable, tasks: Iterable[tuple], *, shared: tuple = ()) -> Iterator[Any]:
@@ -98,13 +112,18 @@ class Workers:
         its arguments must be picklable. Raises MasivError if a process dies.
         """
         tasks = list(tasks)
-        if self.processes == 1 or len(tasks) == 1:
+        if self._here or len(tasks) == 1:
             yield from (run_task(function, (*shared, *task)) for task in tasks)
             return
         with tempfile.TemporaryDirectory(prefix="masiv-") as folder:
-            path = Path(folder) / "shared.pickle"
-            path.write_bytes(pickle.dumps(shared, pickle.HIGHEST_PROTOCOL))
-            futures = [self._submit(function, task, path) for task in tasks]
+            pickled: Any = pickle.dumps(shared, pickle.HIGHEST_PROTOCOL)
+            if self._dask is not None:
+                pickled = self._dask.share(pickled)
+            else:
+                path = Path(folder) / "shared.pickle"
+                path.write_bytes(pickled)
+                pickled = path
+            futures = [self._submit(function, task, pickled) for task in tasks]
             try:
                 for future in futures:
                     yield self._result(future)
@@ -117,13 +136,20 @@ class Workers:
 
         With one process the task runs in that function. Raises MasivError if the process died.
         """
-        if self.processes == 1:
+        if self._here:
             return lambda: run_task(function, task)
         future = self._submit(function, task, None)
         return lambda: self._result(future)
 
-    def _submit(self, function: Callable, task: tuple, shared: Path | None) -> Future[bytes]:
-        return self._running().submit(_run_pickled_task, pickle.dumps((function, task)), shared)
+    @property
+    def _here(self) -> bool:
+        """Whether tasks run in this process."""
+        return self.processes == 1 and self._dask is None
+
+    def _submit(self, function: Callable, task: tuple, shared: Any) -> Future[bytes]:
+        """shared: where the pickled arguments are that come first."""
+        pool = self._dask or self._running()
+        return pool.submit(_run_pickled_task, pickle.dumps((function, task)), shared)
 
     def _result(self, future: Future[bytes]) -> Any:
         try:
@@ -170,11 +196,7 @@ def initialize_process(arch: str, parent: int) -> None:
     started_by = multiprocessing.parent_process()
     assert started_by is not None
     end_with_parent(parent, started_by.join)
-    os.environ.update(ONE_THREAD)
-    import torch
-
-    ti = runtime.start(arch)
-    torch.set_num_threads(1)
+    ti = runtime.start_on_one_thread(arch)
     # Such a process does not call the functions of ``atexit``. This one writes the cache of compiled kernels.
     util.Finalize(None, ti.reset, exitpriority=1)
 
@@ -183,10 +205,10 @@ def _do_nothing() -> None:
     pass
 
 
-def _run_pickled_task(pickled: bytes, shared: Path | None) -> bytes:
-    """``run_task`` in another process."""
+def _run_pickled_task(pickled: bytes, shared: Path | bytes | None) -> bytes:
+    """``run_task`` in another process. shared: the pickled arguments that come first, or a file with them."""
     function, task = pickle.loads(pickled)
-    first = () if shared is None else pickle.loads(shared.read_bytes())
+    first = () if shared is None else pickle.loads(shared if isinstance(shared, bytes) else shared.read_bytes())
     return pickle.dumps(run_task(function, (*first, *task)))
 
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from masiv.workers import ONE_THREAD
+from masiv.runtime import ONE_THREAD
 
 os.environ.update(ONE_THREAD)  # read when numpy, torch and Taichi start
 

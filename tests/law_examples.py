@@ -12,6 +12,7 @@ EXAMPLES = {
     "newtonian": {"viscosity": 40.0, "bulk_modulus": 3e5},
     "non_newtonian": {"shear_modulus": 1e4, "bulk_modulus": 5e4, "yield_stress": 300.0, "plastic_viscosity": 15.0},
     "drucker_prager": {"youngs_modulus": 1e5, "poissons_ratio": 0.3, "friction_angle": 30.0},
+    "springs": {"youngs_modulus": 1e5, "viscosity": 5.0},
 }
 
 

@@ -12,7 +12,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.identification.config import IdentifyConfig
 from masiv.identification.stage import identify
 from masiv.materials.adapter import AdapterLaw
-from masiv.materials.classical import PARAMETERS, ClassicalLaw
+from masiv.materials.classical import CONTINUUM, ClassicalLaw
 from masiv.materials.load import load_law
 from masiv.mpm.rollout import at_rest, rollout
 from masiv.mpm.simulator import Simulator
@@ -28,7 +28,7 @@ def adapter(kind, seed=None):
     return law
 
 
-@pytest.mark.parametrize("kind", list(PARAMETERS))
+@pytest.mark.parametrize("kind", CONTINUUM)
 def test_an_adapter_starts_as_its_classical_law(kind):
     base, law = ClassicalLaw(kind, **EXAMPLES[kind]), adapter(kind)
     trial = torch.cat([gradients(40, 0.03), 0.95 * gradients(20, 0.02, seed=1)])
@@ -42,7 +42,7 @@ def test_an_adapter_starts_as_its_classical_law(kind):
     assert law.wave_modulus() == pytest.approx(base.wave_modulus(), rel=1e-6)
 
 
-@pytest.mark.parametrize("kind", list(PARAMETERS))
+@pytest.mark.parametrize("kind", CONTINUUM)
 def test_an_adapter_is_at_rest_isotropic_and_frame_indifferent(kind):
     q = torch.as_tensor(Rotation.random(random_state=3).as_matrix())
     for seed in range(5):

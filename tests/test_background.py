@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -71,6 +73,28 @@ def test_light_that_changes_is_no_object():
     assert overlap(model.mask(0, pictures[0]), covers[0]) > 0.85
     empty = photograph(rng, 0.85 * plate.astype(np.float32), 4.0, 60)
     assert (model.mask(0, empty) > 0.5).mean() < 0.01
+
+
+def test_large_pictures_take_little_memory_and_keep_their_outlines():
+    """1200 x 960 pixels: learning takes a few float copies of the pictures at most, and a window finds the object."""
+    rng = np.random.default_rng(6)
+    pictures, plate, covers = recording(rng, noise=0.0, jpeg=None)
+    large = [photograph(rng, enlarged(picture), 2.0, 80) for picture in pictures]
+    images, plates = {view: large for view in range(4)}, {view: enlarged(plate).astype(np.uint8) for view in range(4)}
+    tracemalloc.start()
+    model = learn_background(images, plates)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    floats = 4 * sum(image.size for own in images.values() for image in own)
+    assert peak < 3 * floats
+    for image, cover in zip(large, covers, strict=True):
+        assert overlap(model.mask(0, image), enlarged(cover)) > 0.95
+    assert not model.mask(0, plates[0]).any()
+
+
+def enlarged(picture: np.ndarray) -> np.ndarray:
+    large = cv2.resize(picture.astype(np.float32), (960, 960), interpolation=cv2.INTER_LINEAR)
+    return cv2.copyMakeBorder(large, 0, 0, 120, 120, cv2.BORDER_REPLICATE)
 
 
 def test_probabilities_are_calibrated_within_the_outline():

@@ -10,6 +10,7 @@ import pytest
 
 from masiv.errors import NonFiniteError
 from masiv.identification.tracks import clamped_body_model
+from masiv.inference.model_fit import gauss_newton_fit
 from masiv.models.base import Model
 from masiv.models.families import family_of
 from masiv.mpm.config import SimulatorConfig
@@ -146,3 +147,19 @@ def test_effects_divide_the_substep_of_the_law_if_they_are_strong(bar):
     assert substep(500.0) <= body.substep(law, times, acting) < held
     with pytest.raises(NonFiniteError, match="the law with its effects needs substeps"):
         substep(500.0, at=0.1)
+
+
+def test_the_shape_in_which_a_body_was_held_is_found(bar):
+    """Markers are at rest where a hand holds them, 4 mm below the straight bar: their motion begins there."""
+    (run,) = (replace(r, held_straight=False) for r in bar.runs)
+    forward = model_of(replace(bar, runs=(run,)), None)
+    (seen,) = forward.observations
+    name = f"tip_deflection@{seen.name}"
+    assert name in {p.name for p in forward.parameters(MODEL)}
+    straight, held = (forward.path(seen, MODEL, {name: value})(seen.times) for value in (0.0, -0.004))
+    np.testing.assert_allclose(held[0], straight[0], rtol=0, atol=1e-3)
+    assert np.abs(held - straight).max() > 5e-4
+    moved = forward.over([replace(seen, values=held)])
+    fitted = gauss_newton_fit(moved, MODEL, {}, budget=40)
+    assert fitted.values[name] == pytest.approx(-0.004, abs=2e-4)
+    assert fitted.fit_mm < 0.02

@@ -11,6 +11,7 @@ import numpy as np
 from masiv.scene.camera import Camera
 from masiv.scene.frame_cache import Frame, FrameCache
 from masiv.scene.scene import Scene
+from masiv.scene.summary import summarise
 
 SIZE = 10
 FRAME_BYTES = SIZE * SIZE * (3 + 4 + 1)
@@ -78,3 +79,19 @@ def test_a_scene_is_pickled_without_its_frames():
     assert len(pickle.dumps(read)) < empty + 100  # the reader has noted four keys
     assert sent.frame(0, 3).image[0, 0, 0] == 1
     assert sent.load.load.read == [*((0, k) for k in range(4)), (0, 3)]
+
+
+def test_inspect_makes_the_masks_of_a_frame_agree_once_however_long_the_recording():
+    made, reader = [], Reader()
+
+    def agree(of, frame):
+        made.append(frame)
+        return {view: of.frame(view, frame) for view in of.views}
+
+    long = dataclasses.replace(scene(FrameCache(reader, 3 * FRAME_BYTES)), frame_count=9, correct_masks=agree)
+    long._corrected.max_bytes = 3 * FRAME_BYTES
+    looked = []
+    summarise(long, lambda view, frame, picture: looked.append((frame, view)))
+    assert looked == [(frame, view) for frame in range(9) for view in range(3)]
+    assert made == list(range(9))
+    assert len(reader.read) == 27

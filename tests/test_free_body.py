@@ -141,7 +141,7 @@ def test_derivatives_are_taken_with_the_substeps_of_their_point():
     fixed = simulation.held_at(values)
     np.testing.assert_array_equal(fixed.residual(model, values), here)
     with pytest.raises(NonFiniteError, match="needs substeps of"):
-        fixed.residual(model, above)
+        fixed.residual(model, {**values, "viscosity.viscosity": 1.3 * eta})
     jump = np.abs(simulation.residual(model, above) - here).max()
     known = next(p for p in simulation.parameters(model) if p.name == "viscosity.viscosity")
     step = replace(known, step=0.01 / 0.99 * eta, upper=10 * eta)
@@ -149,6 +149,27 @@ def test_derivatives_are_taken_with_the_substeps_of_their_point():
     smooth = (here - simulation.residual(model, {**values, "viscosity.viscosity": 0.95 * eta})) / (0.05 * eta)
     np.testing.assert_allclose(slope, smooth, rtol=0, atol=0.1 * np.abs(smooth).max())
     assert jump / step.step > 3 * np.abs(smooth).max()
+    onwards = (fixed.residual(model, above) - here) / (above["viscosity.viscosity"] - eta)
+    np.testing.assert_allclose(onwards, smooth, rtol=0, atol=0.1 * np.abs(smooth).max())
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_fit_that_the_substep_stopped_goes_on_with_shorter_ones():
+    simulation, _ = small_simulation()
+    model = Model(FAMILIES["neo_hookean"], "sticky")
+    values = {p.name: p.start for p in simulation.parameters(model)}
+
+    def stiffer(factor):
+        return {**values, "youngs_modulus": factor * values["youngs_modulus"]}
+
+    simulation.residual(model, values)
+    assert not simulation.shorten_substeps(model, stiffer(1.1))
+    with pytest.raises(NonFiniteError, match="the law needs substeps of"):
+        simulation.residual(model, stiffer(8.0))
+    assert simulation.held_at(values).shorten_substeps(model, stiffer(8.0))
+    simulation.residual(model, stiffer(8.0))
+    assert not simulation.shorten_substeps(model, stiffer(8.0))
+    assert not simulation.shorten_substeps(model, stiffer(1e6))  # there would be too many
 
 
 @pytest.mark.usefixtures("taichi")

@@ -57,7 +57,7 @@ def test_a_search_that_was_killed_goes_on_with_its_finalists(filmed, seen, tmp_p
     checkpoint, gone_on, shift = Checkpoint(tmp_path / "identify.pt"), [], 0
 
     def fit(kind, *_, **__):
-        names = list(shortlist.FAMILIES)
+        names = list(shortlist.CONTINUUM_FAMILIES)
         return FamilyFit(kind, "sticky", {}, mean_square=float(1 + (names.index(kind) + shift) % len(names)), samples=9)
 
     def further(found, *_, **__):

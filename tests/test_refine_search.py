@@ -108,6 +108,55 @@ def test_effects_that_exclude_each_other_are_never_in_one_model(named):
     assert second.ranking.not_ranked == ({"linear_drag": "it cannot act here in addition"} if named else {})
 
 
+def test_an_effect_on_request_is_looked_for_if_it_is_named():
+    model = LinearModel({}, effects={**EFFECTS, "internal_pressure": EFFECTS["viscosity"]})
+    here = baseline(model, ()).model
+    assert settings().considered(model, here) == list(EFFECTS)
+    named = settings({"effects": ["internal_pressure", "linear_drag"]})
+    assert named.considered(model, here) == ["internal_pressure", "linear_drag"]
+
+
+SPHERE, HALF = "stiffness_contrast", "stiffness_contrast_half_space"
+SHAPES = {
+    "linear_drag": EFFECTS["linear_drag"],
+    SPHERE: pattern(2, TIMES**2, np.exp(-0.5 * (POINTS**2).sum(1) / 0.1**2)),
+    HALF: pattern(2, TIMES**2, (POINTS[:, 2] > 0).astype(float)),
+}
+
+
+def test_the_shapes_of_a_cause_are_looked_for_if_it_is_named():
+    model = LinearModel({}, effects=SHAPES)
+    here, drag = baseline(model).model, "linear_drag"
+    assert settings().considered(model, here) == [drag, SPHERE]
+    assert settings().causes(model, here) == [[drag], [SPHERE]]
+    named = settings({"effects": [SPHERE, drag]})
+    assert named.considered(model, here) == [SPHERE, HALF, drag]
+    assert named.causes(model, here) == [[SPHERE, HALF], [drag]]
+    assert settings({"effects": [HALF]}).considered(model, here) == [HALF]
+    again = named.for_effects([SPHERE])  # what a search did not look at closely enough
+    assert again.considered(model, here) == [SPHERE]
+
+
+@pytest.mark.parametrize("shape", [SPHERE, HALF])
+def test_of_the_shapes_of_a_cause_the_one_that_is_there_is_named_once(shape):
+    model = LinearModel({f"{shape}.strength": 0.1, **DRAG}, effects=SHAPES)
+    result = refined(model, {"effects": [SPHERE, "linear_drag"]})
+    assert {t.name for t in result.accepted} == {shape, "linear_drag"}
+    assert result.after.values[f"{shape}.strength"] == pytest.approx(0.1, abs=2e-3)
+    assert result.search.limits == ()  # its other shape is no further cause
+    first = result.search.rounds[0]
+    assert {c.effect for c in first.candidates} == set(SHAPES)
+
+
+def test_the_shapes_of_a_cause_share_its_prior():
+    """Two shapes that move the body alike are, together, as probable as one cause."""
+    same = {SPHERE: SHAPES[HALF], HALF: SHAPES[HALF]}
+    alone = refined(LinearModel({}, effects={HALF: SHAPES[HALF]}), {"effects": [HALF]})
+    both = refined(LinearModel({}, effects=same), {"effects": [SPHERE]})
+    null = [r.search.rounds[0].posterior.with_at_most(0) for r in (alone, both)]
+    assert null[1] == pytest.approx(null[0], rel=1e-6)
+
+
 def test_what_diverges_is_listed_with_its_reason():
     result = refined(LinearModel({**DRAG}, diverges=("viscosity",)))
     written = document(result)

@@ -72,6 +72,7 @@ def test_filled_cells_stay_bounded_within_the_limit_and_not_far_beyond_it():
         {"viscosity": [500.0]},
         {"stiffness_contrast": [2.0, 0.1, 0.12, 0.1, 0.15]},
         {"viscosity": [500.0], "stiffness_contrast": [2.0, 0.1, 0.12, 0.1, 0.15]},
+        {"anisotropy": [1e6, 0.3, 0.5]},
     ],
 )
 @pytest.mark.parametrize("margin", [1.0, HELD_MARGIN])
@@ -141,6 +142,9 @@ def test_what_effects_ask_together():
     assert first.effects == ("viscosity", "stiffness_contrast")
     last = effects_on(x, stiffness_contrast=[1.0, *place], viscosity=[30.0]).substep_demand()
     assert (last.modulus_factor, last.viscosity) == pytest.approx((math.e, 30.0), rel=1e-4)
+    fibres = effects_on(x, anisotropy=[1e4, 0.0, 0.0], stiffness_contrast=[1.0, *place]).substep_demand()
+    assert (fibres.modulus_factor, fibres.modulus) == pytest.approx((math.e, 1e4 * math.e), rel=1e-4)
+    assert count(SubstepDemand(modulus=3 * 4e4), speed=0.0) == count(SubstepDemand(modulus_factor=4.0), speed=0.0)
 
 
 def test_substeps_are_halved_only_if_their_margin_is_not_enough():

@@ -21,7 +21,7 @@ from masiv.refinement.document import document
 from masiv.refinement.document_text import text
 from masiv.refinement.search_state import SearchSettings
 from masiv.refinement.stage import refine
-from masiv.refinement.support import carried_weight
+from masiv.refinement.support import carried_weight, carried_weight_stderr, question
 
 GRAVITY = np.array([0.0, -9.8, 0.0])
 
@@ -36,6 +36,19 @@ def test_the_part_of_the_weight_that_a_force_carries():
     assert carried_weight("linear_drag", {"rate": 9.8}, GRAVITY) is None
     assert carried_weight("body_force", push, None) is None
     assert carried_weight("body_force", push, np.zeros(3)) is None
+
+
+def test_a_force_that_cancels_gravity_within_its_error_says_that_the_body_is_held():
+    errors = {"acceleration_x": 0.1, "acceleration_y": 0.196, "acceleration_z": 0.1}
+    known = carried_weight_stderr("body_force", errors, GRAVITY)
+    assert known == pytest.approx(0.02)
+    assert carried_weight_stderr("gravity_scale", {"relative_change": 0.03}, GRAVITY) == pytest.approx(0.03)
+    assert carried_weight_stderr("body_force", {**errors, "acceleration_y": None}, GRAVITY) is None
+    assert carried_weight_stderr("linear_drag", {"rate": 0.1}, GRAVITY) is None
+    assert "cancels gravity within its error" in question(0.97, known)
+    assert "is the body held" in question(0.9, known)
+    assert "is the body held" in question(0.97)
+    assert "is the body held" in question(0.6, 1.0)  # it may be nothing as well
 
 
 def test_a_pendulum_that_is_taken_for_a_ball_in_flight_is_said_to_be_held(taichi):
@@ -53,4 +66,5 @@ def test_a_pendulum_that_is_taken_for_a_ball_in_flight_is_said_to_be_held(taichi
     found = document(refine(model, [fit_flights(model)], settings))
     assert found["accepted"]
     assert 0.8 < found["accepted"][0]["carried_weight"] < 1.1
-    assert "is the body held" in text(found)
+    assert found["accepted"][0]["carried_weight_stderr"] > 0
+    assert "of the weight" in text(found)

@@ -31,7 +31,7 @@ from masiv.observations.motion import SampledMotion
 from masiv.refinement.baselines import ALL_FRAMES_STAGE, baselines, differentiated
 from masiv.refinement.hypotheses import Linearizations, linearized, nearly_linearized, weighed
 from masiv.refinement.tasks import map_tasks, rank
-from masiv.workers import TaskError, Workers, process_count, unwrap
+from masiv.workers import TaskError, Workers, process_count, unwrap, workers_for
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -175,6 +175,43 @@ def test_shared_arguments_are_pickled_once(processes):
             assert shared.value == 10
 
 
+@pytest.fixture(scope="module")
+def cluster():
+    """A scheduler with two workers of one thread each."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
+        yield cluster
+
+
+@pytest.mark.slow
+def test_workers_of_a_dask_scheduler_are_as_processes(cluster):
+    with workers_for(0, cluster.scheduler_address) as workers:
+        assert workers.processes == 2
+        CountsPickles.pickles = 0
+        shared = CountsPickles(10)
+        assert list(workers.map(changed, [(k,) for k in range(6)], shared=(shared,))) == [10, 11, 12, 13, 14, 15]
+        assert CountsPickles.pickles == 1
+        assert set(workers.map(threads, [()] * 4)) == {(1, "1")}
+        found = list(workers.map(halved, [(k,) for k in range(4)]))
+        assert [f[0] for f in found[::2]] == [0, 1]
+        assert found[1].reason == "1 is odd"
+        assert os.getpid() not in {f[1] for f in found[::2]}
+        with pytest.raises(InputError, match="no such effect"):
+            unwrap(workers.submit(blamed, ())())
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_cannot_be_used_is_bad_input():
+    distributed = pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="no Dask scheduler answers"):
+        workers_for(0, "tcp://127.0.0.1:1")
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=":0") as wide,
+        pytest.raises(InputError, match="has a worker of 2 threads: start some with dask worker"),
+    ):
+        workers_for(0, wide.scheduler_address)
+
+
 def test_an_error_does_not_wait_for_running_tasks(tmp_path):
     def fail():
         with Workers(2) as workers:
@@ -251,8 +288,19 @@ def test_laws_that_were_fitted_are_not_fitted_again(tmp_path):
     assert fitted.model.contact == "sticky"
 
 
+@pytest.fixture
+def beside(request):
+    """Two processes of this machine, or two workers of a Dask scheduler."""
+    if request.param == "processes":
+        yield request.getfixturevalue("two")
+        return
+    with workers_for(0, request.getfixturevalue("cluster").scheduler_address) as workers:
+        yield workers
+
+
 @pytest.mark.slow
-def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
+@pytest.mark.parametrize("beside", ["processes", "dask"], indirect=True)
+def test_a_ranking_is_the_same_to_the_bit_side_by_side(beside):
     simulation, _ = small_simulation()
     model = Model(FAMILIES["neo_hookean"], "sticky")
     values = {p.name: p.start for p in simulation.parameters(model)}
@@ -261,7 +309,7 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
     simulation.hold_substeps(model, values)
     names = ["linear_drag", "gravity_scale"]
     found = []
-    for workers in (Workers(1), two):
+    for workers in (Workers(1), beside):
         before = simulation.rollouts
         (base,) = map_tasks(workers, simulation, differentiated, [(model, values, 0)])
         ranking = rank(workers, simulation, base, names, robust_scale=1.0, progress=quiet).candidates
@@ -274,9 +322,9 @@ def test_a_ranking_is_the_same_to_the_bit_side_by_side(two):
     for a, b in zip(ranking, other, strict=True):
         assert a.theta == b.theta
         np.testing.assert_array_equal(a.columns, b.columns)
-    alone, beside = (simulation.with_workers(w).finer_grids(model, values, 0) for w in (Workers(1), two))
+    alone, apart = (simulation.with_workers(w).finer_grids(model, values, 0) for w in (Workers(1), beside))
     assert len(alone) == len(simulation.setups[0].finer) >= 2
-    for a, b in zip(alone, beside, strict=True):
+    for a, b in zip(alone, apart, strict=True):
         assert a.any()
         np.testing.assert_array_equal(a, b)
 

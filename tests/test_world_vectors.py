@@ -55,6 +55,16 @@ def test_a_place_without_a_height_is_a_vertical_axis():
     assert found["axis"]["value"] == pytest.approx([0.0, 0.0, 1.0])
 
 
+def test_an_inclination_is_given_as_a_direction_too():
+    """The normal leans from upwards by 30 degrees, towards the first axis of the simulation."""
+    names = ["push.inclination_x", "push.inclination_z"]
+    values = dict(zip(names, (np.pi / 6, 0.0), strict=True))
+    found = vectors_in_world(term(names, ["rad"] * 2), values, dict.fromkeys(names, 0.1), UP_IS_Z)
+    assert found["inclination"]["value"] == pytest.approx([np.pi / 6, 0.0, 0.0])
+    assert found["direction"]["value"] == pytest.approx([0.5, 0.0, np.sqrt(0.75)])
+    assert found["direction"]["unit"] == "1"
+
+
 def test_each_body_has_its_own_and_a_plain_strength_has_none():
     names = [f"push.acceleration_{a} of {body}" for body in ("light", "heavy") for a in "xyz"]
     values = {n: float(k) for k, n in enumerate(names)}

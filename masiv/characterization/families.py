@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from masiv.characterization import curves
 from masiv.errors import InputError
-from masiv.materials.classical import PARAMETERS, UNITS, ClassicalLaw
+from masiv.materials.classical import CONTINUUM, PARAMETERS, UNITS, ClassicalLaw
 from masiv.materials.law import Law
 
 COMPARED_STRAINS = 24
@@ -51,7 +51,8 @@ def nearest_families(law: Law, *, strain: float, log_volume: tuple[float, float]
     coarse = _paths(strain, log_volume, COMPARED_STRAINS)
     guesses = _guesses(law, target)
     found = []
-    for kind, names in PARAMETERS.items():
+    for kind in CONTINUUM:
+        names = PARAMETERS[kind]
         if set(names) <= guesses.keys():
             refined = FINE_INCREMENTS if any("viscosity" in name or "angle" in name for name in names) else 1
             paths = fine if refined > 1 else coarse

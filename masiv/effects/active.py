@@ -16,6 +16,7 @@ from masiv.effects.effect import (
     Effect,
     ForceEffect,
     GeometryEffect,
+    HistoryEffect,
     MassEffect,
     NodalEffect,
     StressEffect,
@@ -30,7 +31,8 @@ E = TypeVar("E", bound=Effect)
 class ActiveEffects:
     """Effects with the values (P,) of their parameters.
 
-    Raises InputError if two of them replace the contact, or if values do not have the shape of the parameters.
+    Raises InputError if two of them replace the contact or keep internal variables, or if values do not have the shape
+    of the parameters.
     """
 
     members: tuple[tuple[Effect, torch.Tensor], ...]
@@ -40,6 +42,9 @@ class ActiveEffects:
         contacts = [effect.name for effect, _ in self.of_kind(ContactEffect)]
         if len(contacts) > 1:
             raise InputError(f"{' and '.join(contacts)} both replace the contact with the ground: use one of them")
+        remembered = [effect.name for effect, _ in self.of_kind(HistoryEffect)]
+        if len(remembered) > 1:
+            raise InputError(f"{' and '.join(remembered)} both keep internal variables: use one of them")
         for effect, theta in self.members:
             if theta.shape != (len(effect.parameters),):
                 raise InputError(

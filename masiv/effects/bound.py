@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.catalogue import causes
+from masiv.effects.catalogue import searched_causes
 from masiv.effects.context import EffectContext
-from masiv.effects.effect import ContactEffect, Effect, NodalEffect, StressEffect
+from masiv.effects.effect import ContactEffect, Effect, HistoryEffect, NodalEffect, StressEffect
 
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
     from masiv.materials.law import BoundLaw
 
 KernelEffect = NodalEffect | ContactEffect | StressEffect
+ALLOCATED_TOGETHER = 4
+"""Effects whose fields are allocated at once: Taichi takes 1024 components of fields at a time, and the adjoint of one
+has up to about 120."""
 
 
 class BoundEffects:
@@ -39,6 +42,10 @@ class BoundEffects:
         self.on_grid = any(not isinstance(e, StressEffect) for e in self.members)
         self.on_stress = any(isinstance(e, StressEffect) for e in self.members)
         self.empty = not self.members and self.force is None
+        self._internal = None
+        for effect, values in zip(self.members, self._values, strict=True):
+            if isinstance(effect, HistoryEffect):
+                self._internal = _internal_variables(mpm, effect, values.shape[-1])
         self._known: list[KernelEffect] = []
         if effects is None or self.empty:
             from masiv.kernels.forward_effects import no_effects
@@ -54,6 +61,24 @@ class BoundEffects:
             values = zip(self.members, self._values, strict=True)
             self.forward.write({self._known.index(e): c for e, c in values}, self._force_values)
 
+    def write_internal(self, values: torch.Tensor | None, first: bool) -> None:
+        """Internal variables (N, K) before local substep 0, None if none are known. first: of the rollout, too."""
+        if self._internal is not None:
+            self._internal.started[None] = 0 if first and values is None else 1
+            if values is None:
+                self._internal.clear(self.count)
+            else:
+                self._internal.write(values)
+
+    def read_internal(self, s: int) -> torch.Tensor | None:
+        """Internal variables (N, K) before local substep s; None if no effect has any."""
+        if self._internal is None:
+            return None
+        internal = self._internal
+        out = torch.empty(self.count, internal.branches * internal.size, dtype=self.mpm.torch_dtype)
+        self._internal.read(s, out)
+        return out
+
     # ---- a substep in several launches -----------------------------------------------------------------------------
 
     def p2g(self, law: BoundLaw, s: int, nodes: int) -> None:
@@ -65,12 +90,12 @@ class BoundEffects:
         self.forward.on_stress(s, self.count)
         self.mpm.p2g(s, self.count, nodes)
 
-    def grid_update(self, offset: int, time: float) -> None:
+    def grid_update(self, offset: int, nodes: int, time: float) -> None:
         """Sum of the chunks' grids into the log at ``offset``; velocities of the nodes: gravity, effects, contact."""
         if self.on_grid:
-            self.forward.grid_update(offset, time)
+            self.forward.grid_update(offset, nodes, time)
         else:
-            self.mpm.grid_update(offset)
+            self.mpm.grid_update(offset, nodes)
 
     def apply_forces(self, s: int) -> None:
         """Forces on the particles at the end of substep s."""
@@ -100,7 +125,11 @@ class BoundAdjoints:
         self.mpm = mpm
         self.count = count
         self._values, self._force_values = values, force
-        self._kernels = [_kernels(mpm, e, c.shape[-1]) for e, c in zip(members, values, strict=True)]
+        self._kernels = []
+        for index, (effect, c) in enumerate(zip(members, values, strict=True)):
+            if index and index % ALLOCATED_TOGETHER == 0:
+                mpm.allocate()
+            self._kernels.append(_kernels(mpm, effect, c.shape[-1]))
         by_kind = list(zip(self._kernels, members, strict=True))
         self.nodes = [k for k, e in by_kind if isinstance(e, NodalEffect)]
         self.contact = [k for k, e in by_kind if isinstance(e, ContactEffect)]
@@ -132,9 +161,9 @@ class BoundAdjoints:
         """Velocities of the nodes in substep s, from the log at ``offset``; offset 0: its grid is not in the log."""
         if not offset:
             self.mpm.p2g(s, self.count, nodes)
-            self.mpm.grid_update(offset)
+            self.mpm.grid_update(offset, nodes)
         elif not self.on_grid:
-            self.mpm.grid_velocities(offset)
+            self.mpm.grid_velocities(offset, nodes)
         if self.on_grid:
             self._grid.free(offset, nodes)
             for kernels in (*self.nodes, *self.contact):
@@ -145,7 +174,7 @@ class BoundAdjoints:
     def grid_update(self, offset: int, nodes: int, time: float) -> None:
         """What ``g2p_adjoint`` scattered -> ``grid_momentum_bar``, after ``restore_grid`` of the same substep."""
         if not self.on_grid:
-            self.mpm.grid_adjoint(offset)
+            self.mpm.grid_adjoint(offset, nodes)
             return
         self._grid.sum_bars(nodes)
         if not self.contact:
@@ -184,10 +213,11 @@ class BoundAdjoints:
 
 
 def _compiled_together(members: list[KernelEffect]) -> list[KernelEffect]:
-    """Effects of the kernel that simulates ``members``: all that a search may name, so that one kernel serves them all;
-    ``members`` alone if others are among them. In the order of ``ForwardEffects``, in which ``members`` are."""
+    """Effects of the kernel that simulates ``members``: all that a search considers by default, so that one kernel
+    serves them all; ``members`` alone if others are among them. In the order of ``ForwardEffects``, in which
+    ``members`` are."""
     kinds = (NodalEffect, ContactEffect, StressEffect)
-    library = [e for kind in kinds for e in causes().values() if isinstance(e, kind)]
+    library = [e for kind in kinds for e in searched_causes().values() if isinstance(e, kind)]
     return library if all(e in library for e in members) else members
 
 
@@ -197,10 +227,23 @@ def _forward_effects(mpm: MpmKernels, effects: list[KernelEffect], context: Effe
     def make() -> Any:
         nodal = [(e.node_velocity(), _size(e, context)) for e in effects if isinstance(e, NodalEffect)]
         contact = [(e.contact_velocity(), _size(e, context)) for e in effects if isinstance(e, ContactEffect)]
-        stress = [(e.particle_stress(), _size(e, context)) for e in effects if isinstance(e, StressEffect)]
+        stress = []
+        for e in effects:
+            if isinstance(e, StressEffect):
+                size = _size(e, context)
+                internal = _internal_variables(mpm, e, size) if isinstance(e, HistoryEffect) else None
+                stress.append((e.particle_stress(), size, internal))
         return ForwardEffects(mpm, nodal, contact, stress)
 
     return mpm.attached((ForwardEffects, tuple(effects)), make)
+
+
+def _internal_variables(mpm: MpmKernels, effect: HistoryEffect, coefficients: int) -> Any:
+    """coefficients: of all branches."""
+    from masiv.kernels.internal_variables import InternalVariables
+
+    sizes = (effect.branches, effect.internal_variables, coefficients // effect.branches)
+    return mpm.attached((InternalVariables, *sizes), lambda: InternalVariables(mpm, *sizes))
 
 
 def _size(effect: KernelEffect, context: EffectContext) -> int:
@@ -210,9 +253,12 @@ def _size(effect: KernelEffect, context: EffectContext) -> int:
 
 
 def _kernels(mpm: MpmKernels, effect: Effect, coefficients: int) -> Any:
-    from masiv.kernels.effects import NodeKernels, StressKernels
+    from masiv.kernels.effects import HistoryKernels, NodeKernels, StressKernels
 
     def make() -> Any:
+        if isinstance(effect, HistoryEffect):
+            internal = _internal_variables(mpm, effect, coefficients)
+            return HistoryKernels(mpm, effect.particle_stress(), internal)
         if isinstance(effect, StressEffect):
             return StressKernels(mpm, effect.particle_stress(), coefficients)
         if isinstance(effect, NodalEffect):

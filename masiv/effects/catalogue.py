@@ -17,6 +17,11 @@ def causes() -> dict[str, Effect]:
     return {name: effect for name, effect in effects().items() if effect.hints.cause}
 
 
+def searched_causes() -> dict[str, Effect]:
+    """The causes that a search considers if the configuration names none."""
+    return {name: effect for name, effect in causes().items() if not effect.hints.on_request}
+
+
 @functools.lru_cache(maxsize=1)
 def effects() -> dict[str, Effect]:
     """Every effect by its name, in alphabetical order: the concrete subclasses of ``Effect`` in the modules here.
@@ -34,6 +39,11 @@ def effects() -> dict[str, Effect]:
             if not inspect.isabstract(value) and hasattr(value, "name"):
                 found[value.name] = value()
     return dict(sorted(found.items()))
+
+
+def cause_of(name: str) -> str:
+    """The cause that the effect of that name is a shape of: itself, unless it says otherwise. Raises InputError."""
+    return effect_named(name).hints.shape_of or name
 
 
 def effect_named(name: str) -> Effect:

@@ -3,7 +3,7 @@ r"""The kinds of effects: physics that a model may lack. At zero strength an eff
 A kind determines where in the model an effect acts, and has one abstract method. In a substep of MLS-MPM
 (``masiv.kernels.mpm``) they act in this order:
 
-1. ``StressEffect``: Kirchhoff stress of the particles, after the law;
+1. ``StressEffect``: Kirchhoff stress of the particles, after the law; ``HistoryEffect``, one with internal variables;
 2. ``NodalEffect``: velocity of the grid's nodes, after gravity;
 3. ``ContactEffect``: velocity of the nodes on or below the ground, in place of the model's contact;
 4. ``ForceEffect``: velocity of the particles, at the end of the substep.
@@ -94,6 +94,24 @@ class StressEffect(Effect):
     def substep_demand(self, theta: torch.Tensor, context: EffectContext) -> SubstepDemand:
         """What parameters (P,) ask of the substep in addition to the law; nothing if not given."""
         return SubstepDemand()
+
+
+class HistoryEffect(StressEffect):
+    r"""$\tau_p \leftarrow \tau_p + \sum_b h_{pb}$ with $h_{pb}, q_{pb} \leftarrow g(\tau_p, F_p, C_p, q_{pb}; c_{pb})$
+    at each particle $p$: branches $b$ with internal variables $q$ that the rollout keeps. At most one may act.
+
+    ``coefficients`` (N, K) are those of the first branch, of the second and so on.
+    """
+
+    branches: ClassVar[int]
+    internal_variables: ClassVar[int]
+    """Numbers of a particle and a branch."""
+
+    @abstractmethod
+    def particle_stress(self) -> Callable[..., Any]:
+        """Taichi function (tau, F, C, q, dt, known, c) -> (h, q) of a branch: as ``StressEffect.particle_stress``,
+        internal variables, substep [s], and 1, or 0 in the first substep of a rollout, where nothing is remembered and
+        q is that of a body that has been in its shape for long."""
 
 
 class MassEffect(Effect):

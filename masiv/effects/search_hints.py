@@ -27,6 +27,11 @@ class SearchHints:
     """The response has no useful derivative at zero strength: it sets in at a finite strength, or all at once."""
     cause: bool = True
     """False for a discrepancy force, which represents unknown physics: no search may name it."""
+    on_request: bool = False
+    """Looked for only if ``refine.effects`` names it: the error rates of the search were calibrated without it."""
+    shape_of: str | None = None
+    """Name of the effect that is another shape of the same cause. A configuration that names that one asks for both; a
+    model has one of them at most, and they share the prior of one cause."""
     needs_clamp: bool = False
     """Looked for in clamped bodies only: on a free body another effect does the same."""
     inside: bool = False

@@ -66,6 +66,8 @@ def newton_scene(
         notes.append("the clamp holds particles up to a particle spacing away from it, in place of grid nodes inside")
     if start.release is not None:
         notes.append("the body starts at rest in its undeformed shape: how it was held before its release is left out")
+        if start.release.motion is not None:
+            notes.append("the clamp does not move: the path along which it is carried is left out")
     gravity, shift = _exact_effects(twin)
     notes += [_left_out(effect) for effect in twin.effects if effect.name not in REPRESENTED]
     settings = {

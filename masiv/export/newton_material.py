@@ -48,6 +48,9 @@ def newton_material(law: Law, quantities: Mapping[str, Any] | None = None) -> tu
         return made | {"viscosity": values["plastic_viscosity"]}, []
     if law.kind == "drucker_prager":
         return granular(*_moduli(law), values["friction_angle"]), []
+    if law.kind == "springs":
+        note = "law springs: an elastic continuum with Poisson's ratio 1/4 in place of springs, without their dampers"
+        return elastic(*_moduli(law)), [note]
     return _of_quantities(law, quantities)
 
 

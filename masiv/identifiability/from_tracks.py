@@ -15,17 +15,23 @@ MOST_MARKERS = 12
 FEWEST_FRAMES = 3
 
 
-def track_motion(tracks: Tracks, run: Run) -> ObservedMotion | None:
-    """The motion of the body of ``run``; None if its markers are all seen in fewer than three frames."""
+def observed_markers(tracks: Tracks, run: Run) -> tuple[tuple[int, ...], np.ndarray, np.ndarray]:
+    """Markers of ``run`` that move with its body (indices), and the frames after the release that show them all:
+    places (T, M, 3) [m], 0 along axes that were not measured, and times (T,) [s since the release, or the start]."""
     moving, body = run.moving(), tracks.bodies[run.body]
     chosen = body.free_markers(run) or tuple(np.flatnonzero(run.axes.any(axis=1)).tolist())
     if len(chosen) > MOST_MARKERS:
         chosen = tuple(chosen[k] for k in np.linspace(0, len(chosen) - 1, MOST_MARKERS).round().astype(int))
     whole = moving.seen[:, list(chosen)].all(axis=1)
-    if whole.sum() < FEWEST_FRAMES:
+    return chosen, np.nan_to_num(moving.positions[whole][:, list(chosen)]), moving.elapsed[whole]
+
+
+def track_motion(tracks: Tracks, run: Run) -> ObservedMotion | None:
+    """The motion of the body of ``run``; None if its markers are all seen in fewer than three frames."""
+    body = tracks.bodies[run.body]
+    chosen, places, times = observed_markers(tracks, run)
+    if len(times) < FEWEST_FRAMES:
         return None
-    places = np.nan_to_num(moving.positions[whole][:, list(chosen)])
-    times = moving.elapsed[whole]
     measured = noise_std(places[:, run.axes[list(chosen)]], MIN_NOISE)
     if run.noise_std is not None:
         measured = max(MIN_NOISE, float(np.sqrt(np.nanmean(run.noise_std[list(chosen)] ** 2))))

@@ -19,11 +19,19 @@ class IdentifyConfig(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     law: Literal[
-        "neural", "adapter", "auto", "neo_hookean", "newtonian", "non_newtonian", "von_mises", "drucker_prager"
+        "neural",
+        "adapter",
+        "auto",
+        "neo_hookean",
+        "newtonian",
+        "non_newtonian",
+        "von_mises",
+        "drucker_prager",
+        "springs",
     ] = Field(
         "neural",
         description="what is fitted: a neural law, a small correction of a classical law, the parameters of a "
-        "classical law, or (auto) of the classical law that explains the motion best",
+        "classical law, or (auto) of the classical law that explains the motion best, or of a body of springs",
     )
     also: list[str] = Field(
         [], description="run folders of other recordings of the same object; a neural law is fitted to all of them"
@@ -47,6 +55,11 @@ class IdentifyConfig(BaseModel):
         0, ge=0, le=32,
         description="processes that run rollouts of starting laws and fits in parallel; 0: one for each core that "
         "Taichi may use, at most four; on a GPU always one",
+    )  # fmt: skip
+    scheduler: str = Field(
+        "", pattern=r"^$|^(tcp|tls|ucx)://\S+$",
+        description="address of a Dask scheduler, as tcp://host:8786, in place of processes: starting laws and fits "
+        "run there",
     )  # fmt: skip
     search_particles: int = Field(2000, ge=100, description="particles of the rollouts that choose the starting law")
     iterations: int = Field(120, ge=0, description="iterations of the joint fit, one rollout of each recording each")

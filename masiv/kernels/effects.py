@@ -8,7 +8,7 @@ that no two of them add to the same gradient.
 import taichi as ti
 
 from masiv import runtime
-from masiv.kernels.grid import DT, DX, NO_GROUND, momentum_of
+from masiv.kernels.grid import DT, DX, FRICTION, contact_adjoint, contact_velocity, momentum_of, two_floats
 
 
 @ti.data_oriented
@@ -29,18 +29,13 @@ class OpenGrid:
                 v = momentum_of(value) / value[3] + self.mpm.constants[DT] * self.mpm.gravity()
             self.mpm.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
 
-    @ti.func
-    def grounded(self, n: ti.i32):
-        row = n // self.mpm.window_shape[None][2]
-        return self.mpm.contact[None] != NO_GROUND and self.mpm.node_height(row) <= 0
-
     @ti.kernel
     def contact(self, nodes: ti.i32):
         for n in range(nodes):
             v = momentum_of(self.mpm.grid_velocity[n])
             self.before[n] = v
-            if self.grounded(n):
-                v = self.mpm.contact_velocity(v)
+            if self.mpm.grounded(n):
+                v = contact_velocity(v, self.mpm.contact[None], self.mpm.constants[FRICTION])
             self.mpm.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
 
     @ti.kernel
@@ -52,8 +47,10 @@ class OpenGrid:
     @ti.kernel
     def contact_adjoint(self, nodes: ti.i32):
         for n in range(nodes):
-            if self.grounded(n):
-                self.mpm.grid_velocity_bar[n] = self.mpm.contact_adjoint(self.before[n], self.mpm.grid_velocity_bar[n])
+            if self.mpm.grounded(n):
+                self.mpm.grid_velocity_bar[n] = contact_adjoint(
+                    self.before[n], self.mpm.grid_velocity_bar[n], self.mpm.contact[None], self.mpm.constants[FRICTION]
+                )
 
     @ti.kernel
     def momentum_adjoint(self, offset: ti.i32, nodes: ti.i32):
@@ -106,14 +103,13 @@ class NodeKernels:
     def concerns(self, n: ti.i32):
         out = True
         if ti.static(self.grounded):
-            row = n // self.mpm.window_shape[None][2]
-            out = self.mpm.contact[None] != NO_GROUND and self.mpm.node_height(row) <= 0
+            out = self.mpm.grounded(n)
         return out
 
     @ti.func
-    def result(self, n: ti.i32, t: ti.f64):
-        """The function at node n, of ``before``, ``held`` and ``coefficients``."""
-        dt, dx, now = self.mpm.constants[DT], self.mpm.constants[DX], ti.cast(t, self.mpm.real)
+    def result(self, n: ti.i32, now):
+        """The function at node n, of ``before``, ``held`` and ``coefficients``; now [s]."""
+        dt, dx = self.mpm.constants[DT], self.mpm.constants[DX]
         x, v = self.mpm.node_position(n), self.before[n]
         if ti.static(self.grounded):
             return self.function(x, v, self.held[n], now, dt, dx, self.coefficients[n])
@@ -121,15 +117,14 @@ class NodeKernels:
             return self.function(x, v, now, dt, dx, self.coefficients[n])
 
     @ti.kernel
-    def apply(self, nodes: ti.i32, t: ti.f64):
-        """``grid_velocity`` -> the same after the effect."""
+    def apply_at(self, nodes: ti.i32, t: ti.f32, t_rest: ti.f32):
         for n in range(nodes):
             v = momentum_of(self.mpm.grid_velocity[n])
             self.before[n] = v
             if self.concerns(n):
                 if ti.static(self.grounded):
-                    self.held[n] = self.mpm.contact_velocity(v)
-                out = self.result(n, t)
+                    self.held[n] = contact_velocity(v, self.mpm.contact[None], self.mpm.constants[FRICTION])
+                out = self.result(n, self.mpm.sum_of_two(t, t_rest))
                 self.mpm.grid_velocity[n] = ti.Vector([out[0], out[1], out[2], 0.0])
 
     @ti.kernel
@@ -141,10 +136,10 @@ class NodeKernels:
             self.held.grad[n] = zero
 
     @ti.kernel
-    def pointwise(self, nodes: ti.i32, t: ti.f64):
+    def pointwise(self, nodes: ti.i32, t: ti.f32, t_rest: ti.f32):
         for n in range(nodes):
             if self.concerns(n):
-                self.after[n] = self.result(n, t)
+                self.after[n] = self.result(n, self.mpm.sum_of_two(t, t_rest))
             else:
                 self.after[n] = self.before[n]
 
@@ -153,13 +148,19 @@ class NodeKernels:
         for n in range(nodes):
             bar = self.before.grad[n]
             if ti.static(self.grounded):
-                bar += self.mpm.contact_adjoint(self.before[n], self.held.grad[n])
+                bar += contact_adjoint(
+                    self.before[n], self.held.grad[n], self.mpm.contact[None], self.mpm.constants[FRICTION]
+                )
             self.mpm.grid_velocity_bar[n] = bar
+
+    def apply(self, nodes: int, t: float) -> None:
+        """``grid_velocity`` -> the same after the effect; t [s]."""
+        self.apply_at(nodes, *two_floats(t))
 
     def adjoint(self, nodes: int, t: float) -> None:
         """``grid_velocity_bar`` after the effect -> before it, from ``before`` as ``apply`` left it."""
         self.load(nodes)
-        runtime.adjoint(self.pointwise, nodes, t)
+        runtime.adjoint(self.pointwise, nodes, *two_floats(t))
         self.store(nodes)
 
 
@@ -268,4 +269,114 @@ class StressKernels:
         """``stress_bar`` after the effect -> before it, from ``before`` as ``apply`` left it."""
         self.load(s, count)
         runtime.adjoint(self.pointwise, count)
+        self.store(count)
+
+
+@ti.data_oriented
+class HistoryKernels:
+    """``function(tau, F, C, q, dt, known, c) -> (h, q)`` on particles, of each branch: as ``StressKernels``, with
+    internal variables q of ``InternalVariables`` and the stress h of the branch, which is added to tau.
+
+    The adjoint is of one branch at a time: Taichi's autodiff takes a minute to compile that of three at once.
+    """
+
+    def __init__(self, mpm, function, internal):
+        self.mpm = mpm
+        self.function = function
+        self.internal = internal
+        self.n = internal.coefficients
+        particles, real = mpm.capacity_particles, mpm.real
+        self.total = ti.Vector.field(self.n, real, shape=(particles, internal.branches))
+        self.before = ti.Matrix.field(3, 3, real, shape=particles, needs_grad=True)
+        self.added = ti.Matrix.field(3, 3, real, shape=particles, needs_grad=True)
+        self.gradient = ti.Matrix.field(3, 3, real, shape=particles, needs_grad=True)
+        self.affine = ti.Matrix.field(3, 3, real, shape=particles, needs_grad=True)
+        self.coefficients = ti.Vector.field(self.n, real, shape=particles, needs_grad=True)
+        self.q_before = ti.Vector.field(internal.size, real, shape=particles, needs_grad=True)
+        self.q_after = ti.Vector.field(internal.size, real, shape=particles, needs_grad=True)
+
+    def write(self, values) -> None:
+        """values (N, K), branch after branch; the sums of their gradients and the adjoint of internal variables after
+        the last substep start at zero."""
+        self.internal.write_coefficients(values)
+        self.internal.clear_bar(len(values))
+        self.clear_total(len(values))
+
+    @ti.kernel
+    def clear_total(self, count: ti.i32):
+        for p, b in ti.ndrange(count, self.internal.branches):
+            self.total[p, b] = ti.Vector.zero(self.mpm.real, self.n)
+
+    @ti.kernel
+    def read_gradient(self, out: ti.types.ndarray()):
+        """out (N, K)."""
+        for p in range(out.shape[0]):
+            for b in range(self.internal.branches):
+                for i in ti.static(range(self.n)):
+                    out[p, b * self.n + i] = self.total[p, b][i]
+
+    @ti.kernel
+    def apply(self, s: ti.i32, count: ti.i32):
+        for p in range(count):
+            tau = self.mpm.kirchhoff_stress[s, p]
+            self.before[p] = tau
+            for b in range(self.internal.branches):
+                h, _ = self.function(
+                    tau, self.mpm.deformation_gradient[s, p], self.mpm.affine_velocity[s, p],
+                    self.internal.values[s, p, b], self.mpm.constants[DT], self.internal.known(s),
+                    self.internal.c[p, b],
+                )  # fmt: skip
+                self.mpm.kirchhoff_stress[s, p] += h
+
+    @ti.kernel
+    def load(self, s: ti.i32, count: ti.i32):
+        zero = ti.Matrix.zero(self.mpm.real, 3, 3)
+        for p in range(count):
+            self.gradient[p] = self.mpm.deformation_gradient[s, p]
+            self.affine[p] = self.mpm.affine_velocity[s, p]
+            self.before.grad[p] = zero
+            self.gradient.grad[p] = zero
+            self.affine.grad[p] = zero
+
+    @ti.kernel
+    def load_branch(self, s: ti.i32, b: ti.i32, count: ti.i32):
+        for p in range(count):
+            self.coefficients[p] = self.internal.c[p, b]
+            self.q_before[p] = self.internal.values[s, p, b]
+            self.added.grad[p] = self.mpm.stress_bar[p]
+            self.q_after.grad[p] = self.internal.bar[p, b]
+            self.coefficients.grad[p] = ti.Vector.zero(self.mpm.real, self.n)
+            self.q_before.grad[p] = ti.Vector.zero(self.mpm.real, self.internal.size)
+
+    @ti.kernel
+    def pointwise(self, s: ti.i32, count: ti.i32):
+        for p in range(count):
+            h, q = self.function(
+                self.before[p], self.gradient[p], self.affine[p], self.q_before[p],
+                self.mpm.constants[DT], self.internal.known(s), self.coefficients[p],
+            )  # fmt: skip
+            self.added[p] = h
+            self.q_after[p] = q
+
+    @ti.kernel
+    def store_branch(self, b: ti.i32, count: ti.i32):
+        for p in range(count):
+            self.internal.bar[p, b] = self.q_before.grad[p]
+            self.total[p, b] += self.coefficients.grad[p]
+
+    @ti.kernel
+    def store(self, count: ti.i32):
+        for p in range(count):
+            self.mpm.stress_bar[p] += self.before.grad[p]
+            self.mpm.gradient_bar[p] += self.gradient.grad[p]
+            self.mpm.affine_bar[p] += self.affine.grad[p]
+
+    def adjoint(self, s: int, count: int) -> None:
+        """``stress_bar`` and ``InternalVariables.bar`` after the effect -> before it, from ``before`` as ``apply`` left
+        it."""
+        self.load(s, count)
+        for b in range(self.internal.branches):
+            self.load_branch(s, b, count)
+            runtime.adjoint(self.pointwise, s, count)
+            self.store_branch(b, count)
         self.store(count)

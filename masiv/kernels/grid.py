@@ -5,6 +5,8 @@ memory is that of the object. On a CPU each chunk of particles scatters into a g
 compare-and-swap loop there, and its order is not reproducible); on a GPU all particles scatter into one, atomically.
 """
 
+import ctypes
+
 import taichi as ti
 
 STICKY, RELEASE, SLIP, NO_GROUND = 0, 1, 2, 3
@@ -17,6 +19,50 @@ DT, DX, VOLUME, GRAVITY_X, GRAVITY_Y, GRAVITY_Z, FRICTION, CONSTANT_COUNT = rang
 def momentum_of(value):
     """The first three of four."""
     return ti.Vector([value[0], value[1], value[2]])
+
+
+def two_floats(t: float) -> tuple[float, float]:
+    """t as the sum of two float32, for the arguments of kernels: Vulkan devices may lack float64."""
+    high = ctypes.c_float(t).value
+    return high, t - high
+
+
+@ti.func
+def contact_velocity(v, contact: ti.i32, friction):
+    """Velocity of a node on or below the ground after contact. Friction is Coulomb's, for ``SLIP``."""
+    out = v
+    if contact == STICKY:
+        out = 0.0 * v
+    elif v[1] < 0.0:
+        if contact == RELEASE:
+            out = 0.0 * v
+        else:
+            tangent = ti.Vector([v[0], 0.0, v[2]])
+            speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
+            kept = 0.0 * speed
+            if speed > -friction * v[1]:
+                kept = 1.0 + friction * v[1] / speed
+            out = kept * tangent
+    return out
+
+
+@ti.func
+def contact_adjoint(v, bar, contact: ti.i32, friction):
+    """Adjoint of ``contact_velocity`` at v."""
+    out = bar
+    if contact == STICKY:
+        out = 0.0 * v
+    elif v[1] < 0.0:
+        out = 0.0 * v
+        if contact == SLIP:
+            mu = friction
+            speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
+            if speed > -mu * v[1]:
+                along = (bar[0] * v[0] + bar[2] * v[2]) / speed
+                kept = 1.0 + mu * v[1] / speed
+                turn = -mu * v[1] * along / (speed * speed)
+                out = ti.Vector([kept * bar[0] + turn * v[0], mu * along, kept * bar[2] + turn * v[2]])
+    return out
 
 
 @ti.data_oriented
@@ -77,6 +123,11 @@ class GridKernels:
         return local, fx, fits
 
     @ti.func
+    def sum_of_two(self, high: ti.f32, low: ti.f32):
+        """What ``two_floats`` took apart."""
+        return ti.cast(high, self.real) + ti.cast(low, self.real)
+
+    @ti.func
     def add(self, t: ti.i32, node: ti.i32, value):
         if ti.static(self.gpu):
             self.partial_grids[t, node] += value
@@ -98,6 +149,11 @@ class GridKernels:
         return ti.Vector([(origin[0] + i) * dx, (origin[1] + j) * dx, (origin[2] + k) * dx])
 
     @ti.func
+    def grounded(self, n: ti.i32):
+        """Whether node n touches the ground."""
+        return self.contact[None] != NO_GROUND and self.node_height(n // self.window_shape[None][2]) <= 0
+
+    @ti.func
     def rows(self):
         return self.window_shape[None][0] * self.window_shape[None][1]
 
@@ -113,19 +169,30 @@ class GridKernels:
         return value
 
     @ti.func
+    def node_velocity(self, n: ti.i32, offset: ti.i32, kick, grounded):
+        """Velocity of node n after gravity and contact, from its momentum in the log at ``offset``."""
+        value = self.grid_momentum[offset + n]
+        v = ti.Vector.zero(self.real, 3)
+        if value[3] > 0.0:
+            v = momentum_of(value) / value[3] + kick
+            if grounded:
+                v = contact_velocity(v, self.contact[None], self.constants[FRICTION])
+        self.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
+
+    @ti.func
     def row_velocities(self, row: ti.i32, offset: ti.i32):
-        """Velocity after gravity and contact of a row's nodes, from their momenta in the log at ``offset``."""
+        """``node_velocity`` of a row's nodes."""
         nz = self.window_shape[None][2]
         kick = self.constants[DT] * self.gravity()
         grounded = self.contact[None] != NO_GROUND and self.node_height(row) <= 0
         for n in range(row * nz, (row + 1) * nz):
-            value = self.grid_momentum[offset + n]
-            v = ti.Vector.zero(self.real, 3)
-            if value[3] > 0.0:
-                v = momentum_of(value) / value[3] + kick
-                if grounded:
-                    v = self.contact_velocity(v)
-            self.grid_velocity[n] = ti.Vector([v[0], v[1], v[2], 0.0])
+            self.node_velocity(n, offset, kick, grounded)
+
+    @ti.func
+    def node_update(self, n: ti.i32, offset: ti.i32):
+        """Node n on a GPU, as ``row_update`` is of a row on a CPU."""
+        self.grid_momentum[offset + n] = self.sum_of_chunks(n)
+        self.node_velocity(n, offset, self.constants[DT] * self.gravity(), self.grounded(n))
 
     @ti.func
     def row_update(self, row: ti.i32, offset: ti.i32):
@@ -135,11 +202,11 @@ class GridKernels:
         self.row_velocities(row, offset)
 
     @ti.kernel
-    def grid_update(self, offset: ti.i32):
+    def grid_update(self, offset: ti.i32, nodes: ti.i32):
         """Sum the chunks' grids into the log at ``offset``, and the velocities that follow."""
         if ti.static(self.gpu):
-            for row in range(self.rows()):
-                self.row_update(row, offset)
+            for n in range(nodes):
+                self.node_update(n, offset)
         else:
             ti.loop_config(block_dim=1)
             for t in range(self.chunks):
@@ -147,11 +214,11 @@ class GridKernels:
                     self.row_update(row, offset)
 
     @ti.kernel
-    def grid_velocities(self, offset: ti.i32):
+    def grid_velocities(self, offset: ti.i32, nodes: ti.i32):
         """``grid_update`` from a logged grid."""
         if ti.static(self.gpu):
-            for row in range(self.rows()):
-                self.row_velocities(row, offset)
+            for n in range(nodes):
+                self.node_velocity(n, offset, self.constants[DT] * self.gravity(), self.grounded(n))
         else:
             ti.loop_config(block_dim=1)
             for t in range(self.chunks):
@@ -159,22 +226,16 @@ class GridKernels:
                     self.row_velocities(row, offset)
 
     @ti.func
-    def contact_velocity(self, v):
-        """Velocity of a node on or below the ground after contact. Friction is Coulomb's, for ``SLIP``."""
-        out = v
-        if self.contact[None] == STICKY:
-            out = ti.Vector.zero(self.real, 3)
-        elif v[1] < 0.0:
-            if self.contact[None] == RELEASE:
-                out = ti.Vector.zero(self.real, 3)
-            else:
-                tangent = ti.Vector([v[0], 0.0, v[2]])
-                speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
-                kept = ti.cast(0.0, self.real)
-                if speed > -self.constants[FRICTION] * v[1]:
-                    kept = 1.0 + self.constants[FRICTION] * v[1] / speed
-                out = kept * tangent
-        return out
+    def node_adjoint(self, n: ti.i32, offset: ti.i32, kick, grounded):
+        out = ti.Vector.zero(self.real, 4)
+        value = self.grid_momentum[offset + n]
+        if value[3] > 0.0:
+            bar = momentum_of(self.sum_of_chunks(n))
+            momentum = momentum_of(value)
+            if grounded:
+                bar = contact_adjoint(momentum / value[3] + kick, bar, self.contact[None], self.constants[FRICTION])
+            out = ti.Vector([bar[0], bar[1], bar[2], -bar.dot(momentum) / value[3]]) / value[3]
+        self.grid_momentum_bar[n] = out
 
     @ti.func
     def row_adjoint(self, row: ti.i32, offset: ti.i32):
@@ -182,41 +243,15 @@ class GridKernels:
         kick = self.constants[DT] * self.gravity()
         grounded = self.contact[None] != NO_GROUND and self.node_height(row) <= 0
         for n in range(row * nz, (row + 1) * nz):
-            out = ti.Vector.zero(self.real, 4)
-            value = self.grid_momentum[offset + n]
-            if value[3] > 0.0:
-                bar = momentum_of(self.sum_of_chunks(n))
-                momentum = momentum_of(value)
-                if grounded:
-                    bar = self.contact_adjoint(momentum / value[3] + kick, bar)
-                out = ti.Vector([bar[0], bar[1], bar[2], -bar.dot(momentum) / value[3]]) / value[3]
-            self.grid_momentum_bar[n] = out
+            self.node_adjoint(n, offset, kick, grounded)
 
     @ti.kernel
-    def grid_adjoint(self, offset: ti.i32):
+    def grid_adjoint(self, offset: ti.i32, nodes: ti.i32):
         if ti.static(self.gpu):
-            for row in range(self.rows()):
-                self.row_adjoint(row, offset)
+            for n in range(nodes):
+                self.node_adjoint(n, offset, self.constants[DT] * self.gravity(), self.grounded(n))
         else:
             ti.loop_config(block_dim=1)
             for t in range(self.chunks):
                 for row in range(t * self.rows() // self.chunks, (t + 1) * self.rows() // self.chunks):
                     self.row_adjoint(row, offset)
-
-    @ti.func
-    def contact_adjoint(self, v, bar):
-        """Adjoint of ``contact_velocity`` at v."""
-        out = bar
-        if self.contact[None] == STICKY:
-            out = ti.Vector.zero(self.real, 3)
-        elif v[1] < 0.0:
-            out = ti.Vector.zero(self.real, 3)
-            if self.contact[None] == SLIP:
-                mu = self.constants[FRICTION]
-                speed = ti.sqrt(v[0] * v[0] + v[2] * v[2])
-                if speed > -mu * v[1]:
-                    along = (bar[0] * v[0] + bar[2] * v[2]) / speed
-                    kept = 1.0 + mu * v[1] / speed
-                    turn = -mu * v[1] * along / (speed * speed)
-                    out = ti.Vector([kept * bar[0] + turn * v[0], mu * along, kept * bar[2] + turn * v[2]])
-        return out

@@ -19,7 +19,9 @@ import torch
 
 from masiv.kernels.grid import DT, DX, VOLUME, GridKernels, momentum_of
 
-NO_ERROR = (1 << 62) - 1
+TOO_FAST, OUTSIDE = 0, 1
+"""Errors of a particle: it is not finite or crosses more than a cell in a substep; it left the window."""
+NO_ERROR = (1 << 31) - 1
 
 
 def log_entries_a_substep(particles: int) -> int:
@@ -53,13 +55,16 @@ class MpmKernels(GridKernels):
         self.torch_dtype = torch.float64 if real == ti.f64 else torch.float32
         self.owner: object = None  # the rollout whose states the fields hold
         self._attached: dict[Hashable, Any] = {}
-        stored = (capacity_steps + 1, capacity_particles)
-        self.position = ti.Vector.field(3, real, shape=stored)
-        self.velocity = ti.Vector.field(3, real, shape=stored)
-        self.affine_velocity = ti.Matrix.field(3, 3, real, shape=stored)
-        self.trial_gradient = ti.Matrix.field(3, 3, real, shape=stored)
-        self.deformation_gradient = ti.Matrix.field(3, 3, real, shape=stored)
-        self.kirchhoff_stress = ti.Matrix.field(3, 3, real, shape=stored)
+        # Threads of a GPU read one entry of neighbouring particles at a time, a core all entries of one particle.
+        stored: dict[str, Any] = {
+            "shape": (capacity_steps + 1, capacity_particles), "layout": ti.Layout.SOA if gpu else ti.Layout.AOS,
+        }  # fmt: skip
+        self.position = ti.Vector.field(3, real, **stored)
+        self.velocity = ti.Vector.field(3, real, **stored)
+        self.affine_velocity = ti.Matrix.field(3, 3, real, **stored)
+        self.trial_gradient = ti.Matrix.field(3, 3, real, **stored)
+        self.deformation_gradient = ti.Matrix.field(3, 3, real, **stored)
+        self.kirchhoff_stress = ti.Matrix.field(3, 3, real, **stored)
         self.position_bar = ti.Vector.field(3, real, shape=capacity_particles)
         self.velocity_bar = ti.Vector.field(3, real, shape=capacity_particles)
         self.affine_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
@@ -68,9 +73,9 @@ class MpmKernels(GridKernels):
         self.stress_bar = ti.Matrix.field(3, 3, real, shape=capacity_particles)
         self.particle_mass = ti.field(real, shape=capacity_particles)
         self.mass_bar = ti.field(real, shape=capacity_particles)
-        self.error_flag = ti.field(
-            ti.i64, shape=2
-        )  # first (substep << 32 | particle) that broke CFL; that left the window
+        # First substep with an error of each kind, and the first particle in it. Vulkan has no 64-bit atomics.
+        self.error_substep = ti.field(ti.i32, shape=2)
+        self.error_particle = ti.field(ti.i32, shape=2)
 
     def attached(self, key: Hashable, make: Callable[[], Any]) -> Any:
         """Kernels with fields of their own for these fields, made once for each ``key``.
@@ -81,14 +86,38 @@ class MpmKernels(GridKernels):
             self._attached[key] = make()
         return self._attached[key]
 
+    def allocate(self) -> None:
+        """Allocate all fields that were declared, which the next launch of a kernel would do."""
+        ti.sync()
+
     # ---- forward -----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def report(self, kind: ti.template(), s: ti.i32, p: ti.i32):
+        """An error of particle p in substep s. All of a substep are reported before one of the next."""
+        if s <= self.error_substep[kind]:
+            ti.atomic_min(self.error_substep[kind], s)
+            ti.atomic_min(self.error_particle[kind], p)
+
+    @ti.func
+    def p2g_plane(self, t: ti.i32, i, local, w, corner, affine, mass):
+        """The nine nodes of plane i of a stencil. An inner loop over planes compiles faster; in two tasks of one kernel
+        Taichi 1.7.4 fails to translate it for Vulkan."""
+        ny, nz = self.window_shape[None][1], self.window_shape[None][2]
+        row = ((local[0] + i) * ny + local[1]) * nz + local[2]
+        for j in ti.static(range(3)):
+            along = corner + i * column(affine, 0) + j * column(affine, 1)
+            weight = w[i, 0] * w[j, 1]
+            for k in ti.static(range(3)):
+                m = (weight * w[k, 2]) * (along + k * column(affine, 2))
+                value = ti.Vector([m[0], m[1], m[2], weight * w[k, 2] * mass])
+                self.add(t, row + j * nz + k, value)
 
     @ti.func
     def p2g_particle(self, t: ti.i32, s: ti.i32, p: ti.i32):
         dx, dt, mass = self.constants[DX], self.constants[DT], self.particle_mass[p]
         local, fx, fits = self.stencil(self.position[s, p], dx)
         if fits:
-            ny, nz = self.window_shape[None][1], self.window_shape[None][2]
             w = self.weights(fx)
             affine = (
                 mass * self.affine_velocity[s, p]
@@ -96,17 +125,14 @@ class MpmKernels(GridKernels):
             )
             corner = mass * self.velocity[s, p] - affine @ (fx * dx)
             affine *= dx
-            for i in range(3):
-                row = ((local[0] + i) * ny + local[1]) * nz + local[2]
-                for j in ti.static(range(3)):
-                    along = corner + i * column(affine, 0) + j * column(affine, 1)
-                    weight = w[i, 0] * w[j, 1]
-                    for k in ti.static(range(3)):
-                        m = (weight * w[k, 2]) * (along + k * column(affine, 2))
-                        value = ti.Vector([m[0], m[1], m[2], weight * w[k, 2] * mass])
-                        self.add(t, row + j * nz + k, value)
+            if ti.static(self.gpu):
+                for i in ti.static(range(3)):
+                    self.p2g_plane(t, i, local, w, corner, affine, mass)
+            else:
+                for i in range(3):
+                    self.p2g_plane(t, i, local, w, corner, affine, mass)
         else:
-            ti.atomic_min(self.error_flag[1], (ti.cast(s, ti.i64) << 32) | p)
+            self.report(OUTSIDE, s, p)
 
     @ti.kernel
     def p2g(self, s: ti.i32, count: ti.i32, nodes: ti.i32):
@@ -151,7 +177,7 @@ class MpmKernels(GridKernels):
             v = momentum_of(v4)
             affine = (4.0 / dx) * (b - v.outer_product(fx))
             if not v.norm() * dt < dx:  # also true for NaN
-                ti.atomic_min(self.error_flag[0], (ti.cast(s, ti.i64) << 32) | p)
+                self.report(TOO_FAST, s, p)
             self.velocity[s + 1, p] = v
             self.affine_velocity[s + 1, p] = affine
             self.position[s + 1, p] = x + dt * v
@@ -163,10 +189,9 @@ class MpmKernels(GridKernels):
         for p in range(count):
             self.g2p_particle(s, p)
 
-    @ti.kernel
-    def bounds(self, s: ti.i32, count: ti.i32) -> ti.types.vector(7, ti.f64):
-        """Lower corner, upper corner [m] and the largest speed [m/s] of the particles at substep s."""
-        out = ti.Vector([1e30, 1e30, 1e30, -1e30, -1e30, -1e30, 0.0], dt=ti.f64)
+    @ti.func
+    def box(self, s: ti.i32, count: ti.i32):
+        out = ti.Vector([1e30, 1e30, 1e30, -1e30, -1e30, -1e30, 0.0], dt=self.real)
         parts = ti.static(1024 if self.gpu else self.chunks)
         ti.loop_config(block_dim=128 if self.gpu else 1)
         for t in range(parts):
@@ -177,10 +202,22 @@ class MpmKernels(GridKernels):
                 high = ti.max(high, self.position[s, p])
                 speed = ti.max(speed, self.velocity[s, p].norm())
             for a in ti.static(range(3)):
-                ti.atomic_min(out[a], ti.cast(low[a], ti.f64))
-                ti.atomic_max(out[3 + a], ti.cast(high[a], ti.f64))
-            ti.atomic_max(out[6], ti.cast(speed, ti.f64))
+                ti.atomic_min(out[a], ti.cast(low[a], self.real))
+                ti.atomic_max(out[3 + a], ti.cast(high[a], self.real))
+            ti.atomic_max(out[6], speed)
         return out
+
+    @ti.kernel
+    def box32(self, s: ti.i32, count: ti.i32) -> ti.types.vector(7, ti.f32):
+        return self.box(s, count)
+
+    @ti.kernel
+    def box64(self, s: ti.i32, count: ti.i32) -> ti.types.vector(7, ti.f64):
+        return self.box(s, count)
+
+    def bounds(self, s: int, count: int):
+        """Lower corner, upper corner [m] and the largest speed [m/s] of the particles at substep s."""
+        return (self.box64 if self.real == ti.f64 else self.box32)(s, count)
 
     @ti.kernel
     def set_window(self, ox: ti.i32, oy: ti.i32, oz: ti.i32, nx: ti.i32, ny: ti.i32, nz: ti.i32):
@@ -188,15 +225,20 @@ class MpmKernels(GridKernels):
         self.window_origin[None] = ti.Vector([ox, oy, oz])
         self.window_shape[None] = ti.Vector([nx, ny, nz])
         for i in ti.static(range(2)):
-            self.error_flag[i] = ti.i64(NO_ERROR)
+            self.error_substep[i] = NO_ERROR
+            self.error_particle[i] = NO_ERROR
 
     @ti.kernel
-    def errors(self) -> ti.types.vector(2, ti.i64):
-        return ti.Vector([self.error_flag[0], self.error_flag[1]])
+    def errors(self) -> ti.types.vector(4, ti.i32):
+        return ti.Vector(
+            [self.error_substep[TOO_FAST], self.error_particle[TOO_FAST],
+             self.error_substep[OUTSIDE], self.error_particle[OUTSIDE]]
+        )  # fmt: skip
 
-    def read_errors(self):
-        """(too fast, outside of the window): each substep << 32 | particle, or -1."""
-        return tuple(-1 if flag == NO_ERROR else int(flag) for flag in self.errors())
+    def read_errors(self) -> tuple[tuple[int, int] | None, ...]:
+        """First (substep, particle) that is too fast or not finite; that left the window. None if there is none."""
+        found = self.errors()
+        return tuple(None if found[i] == NO_ERROR else (int(found[i]), int(found[i + 1])) for i in (0, 2))
 
     # ---- adjoint -------------------------------------------------------------------------------------------------
     # ``*_bar`` hold the adjoint of the state after substep s; each kernel replaces them by that before it.

@@ -32,11 +32,10 @@ class NeuralKernels:
         self,
         moduli: ti.types.ndarray(),
         flows: ti.types.ndarray(),
-        elastic: ti.f64,
-        plastic: ti.f64,
+        strains: ti.types.ndarray(),
         count: ti.i32,
     ):
-        """Tables (nodes, 4), (nodes, 2), and the two strain scales; adjoints start at zero."""
+        """Tables (nodes, 4), (nodes, 2), and the two strain scales (2,); adjoints start at zero."""
         for n in range(moduli.shape[0]):
             for a in ti.static(range(4)):
                 self.moduli[n][a] = moduli[n, a]
@@ -47,8 +46,8 @@ class NeuralKernels:
                 self.flows_bar[t, n] = ti.Vector.zero(self.mpm.real, 2)
         for p in range(count):
             self.flow_strain_bar[p] = 0.0
-        self.strains[0] = ti.cast(elastic, self.mpm.real)
-        self.strains[1] = ti.cast(plastic, self.mpm.real)
+        for a in ti.static(range(2)):
+            self.strains[a] = strains[a]
 
     @ti.kernel
     def read_bars(self, moduli: ti.types.ndarray(), flows: ti.types.ndarray(), strain: ti.types.ndarray()):

@@ -22,6 +22,7 @@ PARAMETERS = {
     "von_mises": (*ELASTIC_PARAMETERS, "yield_stress"),
     "non_newtonian": ("shear_modulus", "bulk_modulus", "yield_stress", "plastic_viscosity"),
     "drucker_prager": (*ELASTIC_PARAMETERS, "friction_angle"),
+    "springs": ("youngs_modulus", "viscosity"),
 }
 UNITS = {
     "youngs_modulus": "Pa",
@@ -35,6 +36,8 @@ UNITS = {
 }
 RANGES = {"poissons_ratio": (-1.0, 0.5), "friction_angle": (0.0, 90.0)}
 """Open intervals of the parameters; (0, infinity) for the others."""
+CONTINUUM = tuple(kind for kind in PARAMETERS if kind != "springs")
+"""Laws of a continuum: a stress of the local deformation, for MPM. Springs connect particles instead."""
 DIFFERENTIABLE = ("neo_hookean", "water")
 """Laws whose kernels have an adjoint."""
 MAXWELL_SHARE = 0.25
@@ -93,6 +96,8 @@ class ClassicalLaw(Law):
         if self.kind == "non_newtonian":
             mu = self.values["shear_modulus"]
             return mu, self.values["bulk_modulus"] - 2 / 3 * mu
+        if self.kind == "springs":  # central forces: lambda = mu (Cauchy), E = 5/2 mu
+            return 0.4 * self.values["youngs_modulus"], 0.4 * self.values["youngs_modulus"]
         mu, lam = lame(self.values["youngs_modulus"], self.values["poissons_ratio"])
         return (torch.zeros_like(mu) if self.kind == "water" else mu), lam
 
@@ -117,7 +122,7 @@ class ClassicalLaw(Law):
         return torch.stack([mu, lam, math.sqrt(2 / 3) * 2 * sine / (3 - sine)])
 
     def project(self, trial_gradient: torch.Tensor, dt: float) -> torch.Tensor:
-        if self.kind == "neo_hookean":
+        if self.kind in ("neo_hookean", "springs"):
             return trial_gradient
         c = self.coefficients(dt).to(trial_gradient.dtype)
         if self.kind == "water":
@@ -152,6 +157,8 @@ class ClassicalLaw(Law):
             b = j ** (-2 / 3) * (deformation_gradient @ deformation_gradient.mT)
             bulk = self.values["bulk_modulus"].to(b.dtype)
             return mu * (b - b.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * eye) + bulk / 7 * (j - j**-6) * eye
+        if self.kind == "springs":
+            return _mean_tension(deformation_gradient, self.values["youngs_modulus"].to(eye.dtype))
         u, s, _ = torch.linalg.svd(deformation_gradient)
         strain = torch.log(s)
         principal = 2 * mu * strain + lam * strain.sum(1, keepdim=True)
@@ -162,6 +169,8 @@ class ClassicalLaw(Law):
         return float((lam + 2 * mu).detach())
 
     def bind(self, kernels: MpmKernels, count: int, dt: float) -> BoundLaw:
+        if self.kind == "springs":
+            raise MasivError("springs are between particles (masiv.mpm.spring_rollout): the grid has no kernel of them")
         return _BoundClassical(self, kernels, count, dt)
 
     def description(self) -> dict[str, Any]:
@@ -175,6 +184,22 @@ class ClassicalLaw(Law):
 
     def file_metadata(self) -> dict[str, str]:
         return {"kind": self.kind, "stderr": json.dumps(self.stderr)}
+
+
+def _mean_tension(f: torch.Tensor, youngs_modulus: torch.Tensor) -> torch.Tensor:
+    """Kirchhoff stress (N, 3, 3) [Pa] of springs in all directions n alike, by the Cauchy-Born rule: the mean of
+    6 E (s - 1) / s (F n) (F n)^T with the stretch s = |F n|. ``masiv.mpm.spring_graph`` has the energy.
+
+    Over the 26 directions of Lebedev's rule of degree 7: exact for small strain.
+    """
+    axis = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=f.dtype)] * 3)
+    kind = axis.abs().sum(1).long()
+    share = torch.tensor([0.0, 1 / 21, 4 / 105, 9 / 280], dtype=f.dtype)[kind]
+    axis, length = axis[kind > 0], axis[kind > 0].norm(dim=1)
+    moved = torch.einsum("nij,kj->nki", f, axis)
+    stretch = moved.norm(dim=2) / length
+    weight = 6 * youngs_modulus * share[kind > 0] * (stretch - 1) / stretch
+    return torch.einsum("nk,nki,nkj->nij", weight / length**2, moved, moved)
 
 
 def isochoric_flow(f: torch.Tensor, share: torch.Tensor) -> torch.Tensor:

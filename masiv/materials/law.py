@@ -35,7 +35,7 @@ class BoundLaw(ABC):
 
     def substeps(self, mpm: MpmKernels, effects: Any, serial: bool) -> SubstepKernels | None:
         """Kernels of whole substeps with this law and ``effects`` (``NoEffects`` or ``ForwardEffects``), ready to be
-        launched; None if it has none, and on a GPU."""
+        launched; None if it has none."""
         return None
 
     @abstractmethod
@@ -75,8 +75,6 @@ class SharedBoundLaw(BoundLaw):
             whole.transfer(s, count, nodes)
 
     def substeps(self, mpm: MpmKernels, effects: Any, serial: bool) -> SubstepKernels | None:
-        if mpm.gpu:
-            return None
         self._own()
         from masiv.kernels.substep import SubstepKernels
 

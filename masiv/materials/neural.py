@@ -253,8 +253,8 @@ class _BoundNeural(SharedBoundLaw):
 
     def write(self) -> None:
         moduli, flows = (t.detach().to(self.dtype).contiguous() for t in self.tables[:2])
-        flow_strain = float(self.tables[2].detach())
-        self.kernels.write_tables(moduli, flows, STRAIN_SCALE, flow_strain, self.count)
+        strains = torch.tensor([STRAIN_SCALE, float(self.tables[2].detach())], dtype=self.dtype)
+        self.kernels.write_tables(moduli, flows, strains, self.count)
 
     def parameter_gradients(self) -> tuple[torch.Tensor | None, ...]:
         bars = [torch.empty(len(self.tables[0]), width, dtype=self.dtype) for width in (4, 2)]

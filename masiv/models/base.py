@@ -143,6 +143,11 @@ class ForwardModel(ABC):
         a number of substeps, is as at ``values``. It shares with this one what a copy with other observations does."""
         return self
 
+    def shorten_substeps(self, model: Model, values: Mapping[str, float]) -> bool:
+        """Simulate with shorter substeps from now on, in all that shares them, if a fit that ended at ``values`` may
+        have been stopped by how long they are; whether it was. Not if there would be too many."""
+        return False
+
     @abstractmethod
     def parameters(self, model: Model) -> tuple[Parameter, ...]:
         """Everything that is fitted: law, effects, and what belongs to each recording."""

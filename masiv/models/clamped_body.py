@@ -21,6 +21,7 @@ from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.effect import ClockEffect, ContactEffect, Effect, GeometryEffect
 from masiv.effects.per_body import DragBody
+from masiv.errors import MasivError
 from masiv.materials.classical import UNITS, ClassicalLaw
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model
 from masiv.models.cache import Arrays, RolloutCache
@@ -64,6 +65,12 @@ def run_of_body(
     points = body.markers_to_world(body.particles[None])[0]
     speed = run.released(body.markers, skipped, duration)[2]
     return marker_observation(run, body.markers, points, duration, skipped), replace(body, speed=speed)
+
+
+def output_times(run: TracksObservation) -> np.ndarray:
+    """Times (K,) [s] since the release at which the states of a rollout of ``run`` are kept."""
+    last = float(run.times[-1]) + RELEASE_RANGE
+    return np.linspace(0, last, int(np.ceil(last / OUTPUT_INTERVAL)) + 1)
 
 
 class ClampedBodyModel(ForwardModel):
@@ -137,11 +144,16 @@ class ClampedBodyModel(ForwardModel):
         """The delay [s] of the release, and how far [m] from its rest the body was held along two horizontal axes.
 
         If the first moments of ``run`` are left out, also how far above its rest it was held, and a deflection [m] of
-        its tip at the start (see ``static_deflection``) for the energy that they took or gave."""
+        its tip at the start (see ``static_deflection``) for the energy that they took or gave. If the body was not held
+        straight, the deflection is that in which it was held, where its markers are at their places at rest. Nothing of
+        a body whose clamp is carried: it is at rest there, and its markers at their places at rest."""
+        if self.body(run).motion is not None:
+            return ()
         names = ["lateral_offset_1", "lateral_offset_2"]
         deflection: tuple[Parameter, ...] = ()
         if run.skipped:
             names.append("vertical_offset")
+        if run.skipped or not run.held_straight:
             if self.body(run).clamp_axes is not None:
                 size = self.body(run).size
                 reach, step = DEFLECTION_RANGE * size, DEFLECTION_STEP * size
@@ -227,6 +239,17 @@ class ClampedBodyModel(ForwardModel):
         check_substep(taken, needed)
         return taken
 
+    def shorten_substeps(self, model: Model, values: Mapping[str, float]) -> bool:
+        """See ``ForwardModel``."""
+        law, needed = self.law(model, values), {}
+        try:
+            for run in self.observations:
+                body = self.body(run)
+                needed[run.name, body.spacing] = body.substep(law, output_times(run))
+        except MasivError:
+            return False
+        return any([self.held.shorten(key, own) for key, own in needed.items()])
+
     def acting(
         self, run: TracksObservation, model: Model, values: Mapping[str, float], duration: float
     ) -> ActiveEffects:
@@ -244,9 +267,9 @@ class ClampedBodyModel(ForwardModel):
     def path(self, run: TracksObservation, model: Model, values: Mapping[str, float]) -> CubicSpline:
         """Markers (M, 3) [m, world] over time [s] since the release. Raises NonFiniteError."""
         body, law = self.body(run), self.law(model, values)
-        deflection = values.get(f"tip_deflection@{run.name}", 0.0) if run.skipped else 0.0
-        last = float(run.times[-1]) + RELEASE_RANGE
-        times = np.linspace(0, last, int(np.ceil(last / OUTPUT_INTERVAL)) + 1)
+        deflection = values.get(f"tip_deflection@{run.name}", 0.0) if run.skipped or not run.held_straight else 0.0
+        times = output_times(run)
+        last = float(times[-1])
         with failures_as_divergence():
             substep = self.substep(run, model, values, times)
             effects = self.acting(run, model, values, last)
@@ -263,11 +286,17 @@ class ClampedBodyModel(ForwardModel):
                 return {"times": instants, "markers": body.markers_to_world(positions)}
 
             found = self._rollout_cache.get(key, rolled_out)
-        return CubicSpline(found["times"], found["markers"])
+        markers = found["markers"]
+        if (deflection and not run.skipped) or body.motion is not None:
+            straight = body.markers_to_world(body.particles[None])[0]
+            markers = markers - (markers[0] - straight)
+        return CubicSpline(found["times"], markers)
 
     def markers(self, run: TracksObservation, model: Model, values: Mapping[str, float]) -> np.ndarray:
         """Markers (K, M, 3) [m, world] of the model at the run's times. Raises NonFiniteError."""
         names = [p.name for p in self.release_parameters(run)]
+        if not names:
+            return self.path(run, model, values)(run.times)
         if not run.fitted or not all(name in values for name in names):
             return self.fit_release(run, model, values)[1]
         start = np.array([values[name] for name in names])

@@ -18,7 +18,7 @@ from masiv.effects.effect import Effect
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.law import Law
 from masiv.mpm.config import SimulatorConfig
-from masiv.mpm.design import HELD_MARGIN, NO_DEMAND, grid_spacing, substeps_per_frame
+from masiv.mpm.design import DIFFERENCE_MARGIN, HELD_MARGIN, NO_DEMAND, grid_spacing, substeps_per_frame
 from masiv.mpm.rollout import rollout
 from masiv.mpm.simulator import Simulator
 from masiv.mpm.state import State
@@ -174,6 +174,15 @@ class HeldSubsteps:
         _refuse_if_too_long("the law", held, needed)
         return held
 
+    def shorten(self, key: Hashable, needed: float) -> bool:
+        """Hold ``needed`` [s] if a law that needs it has used more than half of the margin (in the logarithm); whether
+        that changed what is held. A fit that ends there was stopped by the substep, not by the data."""
+        held = self._held.get(key, needed)
+        if needed * math.sqrt(HELD_MARGIN) >= held:
+            return False
+        self._held[key] = needed
+        return True
+
     def clear(self) -> None:
         """Hold nothing."""
         self._held.clear()
@@ -195,8 +204,9 @@ def halved(held: float, needed: float, shortest: float) -> float:
 
 
 def check_substep(taken: float, needed: float) -> None:
-    """Raises NonFiniteError if ``taken`` [s] is longer than ``needed`` [s] by more than ``HELD_MARGIN``."""
-    _refuse_if_too_long("the law with its effects", taken, needed)
+    """Raises NonFiniteError if ``taken`` [s], which is that of a point, is longer than ``needed`` [s] a finite
+    difference away by more than ``HELD_MARGIN`` and ``DIFFERENCE_MARGIN``."""
+    _refuse_if_too_long("the law with its effects", taken, DIFFERENCE_MARGIN * needed)
 
 
 def _refuse_if_too_long(what: str, taken: float, needed: float) -> None:

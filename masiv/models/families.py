@@ -1,7 +1,7 @@
 """The classical families of laws that can be fitted: their parameters, and where a search starts.
 
-The five of PAC-NeRF (Li et al. 2023) and GIC (Cai et al. 2024). Values are for 1000 kg/m^3: what moves a body is a
-modulus over its density.
+The five of PAC-NeRF (Li et al. 2023) and GIC (Cai et al. 2024), and the springs of Spring-Gaus (Zhong et al. 2024).
+Values are for 1000 kg/m^3: what moves a body is a modulus over its density.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from masiv.materials.classical import UNITS, ClassicalLaw
+from masiv.materials.classical import CONTINUUM, UNITS, ClassicalLaw
 from masiv.models.parameters import Parameter
 
 MODULUS = Parameter("youngs_modulus", 3e4, 3e2, 1e7, 0.05, log=True)
@@ -81,8 +81,15 @@ FAMILIES = {
             (MODULUS, RATIO, Parameter("friction_angle", 30.0, 1.0, 70.0, 1.0)),
             {"youngs_modulus": (1e5, 5e5), "friction_angle": (15.0, 30.0, 45.0)},
         ),
+        Family(
+            "springs",
+            (MODULUS, Parameter("viscosity", 3.0, 0.01, 1e3, 0.1, log=True)),
+            {"youngs_modulus": (3e3, 1e4, 3e4, 1e5, 3e5), "viscosity": (1.0, 30.0)},
+        ),
     )
 }
+CONTINUUM_FAMILIES = tuple(kind for kind in FAMILIES if kind in CONTINUUM)
+"""Those among which a search for the law chooses. Springs are fitted if they are asked for."""
 
 
 def law_of(family: Family, values: Mapping[str, float]) -> ClassicalLaw:

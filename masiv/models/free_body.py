@@ -12,6 +12,7 @@ import torch
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.effect import ContactEffect
+from masiv.errors import MasivError
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model, effect_parameters, plain_term
 from masiv.models.cache import RolloutCache
 from masiv.models.deformable import HeldSubsteps, check_substep, failures_as_divergence
@@ -70,6 +71,15 @@ class FreeBodyModel(ForwardModel):
         law = law_of(model.family, values)
         for index, r in enumerate(self.setups):
             r.body.held_substeps(law, self.held, (index, model.family.kind))
+
+    def shorten_substeps(self, model: Model, values: Mapping[str, float]) -> bool:
+        """See ``ForwardModel``."""
+        law, kind = law_of(model.family, values), model.family.kind
+        try:
+            needed = [1 / (r.body.scene.fps * r.body.substeps(law)) for r in self.setups]
+        except MasivError:
+            return False
+        return any([self.held.shorten((index, kind), own) for index, own in enumerate(needed)])
 
     def held_at(self, values: Mapping[str, float]) -> FreeBodyModel:
         """See ``ForwardModel``."""

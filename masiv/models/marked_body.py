@@ -4,28 +4,43 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.errors import InputError
+from masiv.effects.boundary.clamp import with_clamp, with_moving_clamp
+from masiv.effects.context import EffectContext
+from masiv.effects.effect import Effect, HistoryEffect
+from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.law import Law
 from masiv.models.attachment import Attachment, attach
 from masiv.models.deformable import DeformableBody, checked_instants
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest
+from masiv.mpm.simulator import Simulator
 from masiv.mpm.state import State
+from masiv.observations.identity import content_hash
 from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import fill_geometry
 from masiv.tracks.placement import Placement
+from masiv.tracks.prescribed_motion import PrescribedMotion, prescribed_motion
 from masiv.tracks.tracks import Clamp, Run, Tracks
 
 TILT_WEIGHT = 1e-3
 """Weight of the rotation's trace relative to the height of y: it decides between equal choices of axes."""
+SETTLING_SUBSTEPS = 32
+"""Between two looks at the kinetic energy of a body that comes to rest …"""
+SETTLED = 1e-6
+"""… which has come to rest when a peak is below this part of the highest one: the way still to go is a thousandth of
+what it sagged …"""
+MAX_SETTLING = 2000
+"""… and looks after which it never does, as a fluid."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,12 +48,23 @@ class MarkedBody(DeformableBody):
     """A body that is let go from rest, with markers that are tied to its material.
 
     contact: with the ground; attachment: of ``markers``, the run's markers that move with the material (indices into
-    ``run.markers``). particles: float64.
+    ``run.markers``). particles: float64. motion: of the clamp, if it is carried. Then the body is at rest in it before.
     """
 
     contact: str
     attachment: Attachment
     markers: tuple[int, ...]
+    motion: PrescribedMotion | None = None
+
+    @cached_property
+    def digest(self) -> str:
+        """See ``DeformableBody``."""
+        own = super().digest
+        return own if self.motion is None else content_hash((own, self.motion))
+
+    def effects(self, members: Sequence[tuple[Effect, torch.Tensor]], context: EffectContext) -> ActiveEffects:
+        """See ``DeformableBody``; without a clamp that is carried, which ``pieces`` adds."""
+        return super().effects(members, context) if self.motion is None else ActiveEffects(tuple(members), context)
 
     @property
     def clamp_axes(self) -> tuple[torch.Tensor, torch.Tensor] | None:
@@ -54,7 +80,7 @@ class MarkedBody(DeformableBody):
             x, gradient = static_deflection(x, self.heights[0], axes, deflection)
         still = torch.zeros_like(x, dtype=dtype)
         state = at_rest(x.to(dtype), still, torch.zeros_like(gradient, dtype=dtype))
-        return replace(state, trial_gradient=gradient.to(dtype).contiguous())
+        return replace(state, trial_gradient=gradient.to(dtype).contiguous(), rest_position=self.particles.to(dtype))
 
     def markers_to_world(self, positions: torch.Tensor) -> np.ndarray:
         """Particles (T, N, 3) [m, simulation axes] -> markers (T, len(markers), 3) [m, world]."""
@@ -80,16 +106,87 @@ class MarkedBody(DeformableBody):
         """Instants (T,) [s since the release], the ends of the substeps nearest to ``times`` (T,) [s]; and positions
         (T, N, 3) [m, simulation axes] there.
 
-        effects: with the clamp, see ``DeformableBody.effects``; the clamp alone if None. substep [s]: see ``substep``.
-        deflection: see ``released``. Raises NonFiniteError, and as ``substep``.
+        effects: see ``effects``; the clamp alone if None. substep [s]: see ``substep``. deflection: see ``released``.
+        Raises NonFiniteError, and as ``substep``.
         """
         interval = mean_interval(times)
         effects = effects or self.effects((), self.context(float(times[-1]), interval))
         substep = substep or self.substep(law, times, effects)
         outputs = [round(float(t) / substep) for t in times]
-        state = self.released(dtype, deflection)
-        positions = self.rollout(law, state, outputs, substep=substep, contact=self.contact, effects=effects)
-        return np.array(outputs) * substep, positions
+        if self.motion is None:
+            state = self.released(dtype, deflection)
+            positions = self.rollout(law, state, outputs, substep=substep, contact=self.contact, effects=effects)
+            return np.array(outputs) * substep, positions
+        return np.array(outputs) * substep, self._carried(law, outputs, effects, substep, dtype)
+
+    @torch.no_grad()
+    def _carried(
+        self, law: Law, outputs: Sequence[int], effects: ActiveEffects, substep: float, dtype: torch.dtype
+    ) -> torch.Tensor:
+        """Positions (T, N, 3) after each of ``outputs`` substeps, of a body whose clamp moves."""
+        simulator = self.simulator(substep, self.contact, dtype)
+        state = self.at_start(simulator, law, effects, dtype)
+        found = {0: state.position}
+        wanted = sorted(set(outputs))
+        for begin, end, acting in self.pieces(effects, 0, wanted[-1], substep):
+            own = [step for step in wanted if begin < step <= end]
+            try:
+                done = simulator.run(state, law, end - begin, [s - begin for s in own], acting, begin * substep)
+            except NonFiniteError as error:
+                raise NonFiniteError(begin + error.substep, error.particle, error.detail) from error
+            found |= dict(zip(own, done.positions, strict=True))
+            state = done.final
+        return torch.stack([found[step] for step in outputs])
+
+    def at_start(self, simulator: Simulator, law: Law, effects: ActiveEffects, dtype: torch.dtype) -> State:
+        """The state at the release: ``released``, or at rest in a clamp that will be carried."""
+        return self.released(dtype) if self.motion is None else self._settled(simulator, law, effects, dtype)
+
+    def _settled(self, simulator: Simulator, law: Law, effects: ActiveEffects, dtype: torch.dtype) -> State:
+        """At rest in the clamp before it moves. By dynamic relaxation with kinetic damping (Cundall 1976): velocities
+        become zero whenever the kinetic energy passes a peak. Stresses that relax have done so. Raises MasivError if it
+        does not come to rest."""
+        lasting = tuple(m for m in effects.members if not isinstance(m[0], HistoryEffect))
+        acting = with_clamp(ActiveEffects(lasting, effects.context), self.normals, self.heights)
+        state, before, highest = self.released(dtype), 0.0, 0.0
+        for _ in range(MAX_SETTLING):
+            state = simulator.run(state, law, SETTLING_SUBSTEPS, [], acting).final
+            energy = float(state.velocity.double().square().sum())
+            if energy < before:
+                highest = max(highest, before)
+                still = torch.zeros_like(state.velocity)
+                state = replace(state, velocity=still, affine_velocity=torch.zeros_like(state.affine_velocity))
+                if before <= SETTLED * highest or highest == 0:
+                    return state
+                before = 0.0
+            elif energy == 0:
+                return state
+            else:
+                before = energy
+        raise MasivError("a body that is carried does not come to rest in its clamp: is its law one of a solid?")
+
+    def pieces(
+        self, effects: ActiveEffects, begin: int, end: int, substep: float
+    ) -> Iterator[tuple[int, int, ActiveEffects]]:
+        """Substeps ``begin`` to ``end`` in parts, each with its effects: ``effects``, and the part of the motion of a
+        clamp that is carried; none if there is no substep."""
+        if self.motion is None:
+            if end > begin:
+                yield begin, end, effects
+            return
+        turn, centre = self.axes.rotation, self.axes.points_to_simulation(self.motion.centre)
+        at_rest = self.axes.vectors_to_world(self.normals.numpy())
+        heights = self.heights - torch.as_tensor(self.normals.numpy() @ centre)
+        for part in self.motion.segments(end * substep):
+            first, last = (min(max(round(t / substep), begin), end) for t in (part.start, part.stop))
+            if first == last:
+                continue
+            position = part.position @ turn.T
+            position[0] += self.axes.translation
+            yield first, last, with_moving_clamp(
+                effects, part.start, torch.as_tensor(position), torch.as_tensor(turn @ part.omega),
+                torch.as_tensor(self.axes.vectors_to_simulation(at_rest @ part.rotation.T)), heights,
+            )  # fmt: skip
 
 
 def mean_interval(times: np.ndarray) -> float:
@@ -129,6 +226,7 @@ def marked_body(
         ground=tracks.ground,
         contact=contact if tracks.ground is not None else "none",
         speed=speed,
+        motion=None if body.clamp is None else prescribed_motion(run, body.clamp),
     )
 
 
@@ -148,10 +246,11 @@ def placed_body(
     ground: Ground | None,
     contact: str,
     speed: float,
+    motion: PrescribedMotion | None = None,
 ) -> MarkedBody:
     """Particles ``own`` (N, 3) [m, own axes], ``particle_spacing`` [m] apart, at a place in the world, and markers tied
     to them that are ``at_rest`` (M, 3) [m, world]. volume [m³]; density [kg/m³]; up (3,) and gravity (3,) [m/s²]:
-    world; speed [m/s]: see ``DeformableBody``.
+    world; speed [m/s]: see ``DeformableBody``. motion: of the clamp, if it is carried.
 
     The grid holds ``config.particles_per_cell`` of them a cell. Without a ground it runs along the body's own axes, a
     plane of its nodes in each face of the clamp's first plane, so that neither is blurred.
@@ -181,6 +280,7 @@ def placed_body(
         contact=contact,
         attachment=attach(particles, axes.points_to_simulation(at_rest), particle_spacing),
         markers=markers,
+        motion=motion,
     )
 
 

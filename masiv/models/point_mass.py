@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
+from masiv import runtime
 from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.effect import Effect, NodalEffect
@@ -139,6 +140,10 @@ class PointMassModel(ForwardModel):
             made = [Parameter(n, max(p.start, p.lower), p.lower, p.upper, p.step) for n, p in own]
             cut *= len(bodies) if each else 1
             guesses = plain_term(effect, self._context(self.observations[0])).guesses
+            if known.per_body is not None:
+                guesses = tuple(known.per_body.guesses() or guesses)
+            if each:
+                guesses = tuple(guess * len(bodies) for guess in guesses)
             units = {n: p.unit for n, p in own}
             self.terms[name] = EffectTerm(name, effect, tuple(made[:cut]), tuple(made[cut:]), guesses, units, bodies)
         return self.terms[name]
@@ -283,6 +288,7 @@ def fly(
     counts = np.maximum(np.ceil(gaps / substep), 1).astype(np.int32)
     out = np.zeros((len(starts), len(times), 3))
     coefficients = np.concatenate([c for _, c in members] or [np.zeros(1)])
+    runtime.check_float64("the flight of a mass point")
     kernels = point_kernels(tuple((effect, len(c)) for effect, c in members))
     kernels.fly(
         np.ascontiguousarray(begin), np.ascontiguousarray(gravity, dtype=np.float64),

@@ -43,6 +43,9 @@ HELD_MARGIN = 1.4
 """How many times shorter a substep may be needed than the one that is taken, where that is held (``HeldSubsteps``). The
 Courant number is then this times ``simulator.courant_number``: below the limit of 1 up to a setting of 0.71 (default
 0.3); not derived above."""
+DIFFERENCE_MARGIN = 1.1
+"""As many times shorter again at the other point of a finite difference: else a law at the margin would have no
+derivative by what stiffens it. Chosen; a difference of 20 % of a modulus is within it."""
 NO_DEMAND = SubstepDemand()
 
 
@@ -77,18 +80,18 @@ def substeps_per_frame(
 ) -> int:
     """Substeps in a frame such that sound and matter at ``speed`` [m/s] together cross at most ``courant_number`` cells
     in each, and that ``viscous_substep`` allows. Sound is sqrt(STIFFENING wave_modulus / density), wave_modulus [Pa]
-    that of the law at rest times the factor of ``demand``. Raises MasivError that names the law, or the effects, if
-    that is more than the configuration allows."""
+    that of the law at rest times the factor of ``demand``, plus what that adds. Raises MasivError that names the law,
+    or the effects, if that is more than the configuration allows."""
 
-    def sound(factor: float) -> int:
-        crossing = math.sqrt(STIFFENING * factor * max(wave_modulus, 0.0) / density) + speed
+    def sound(factor: float, added: float) -> int:
+        crossing = math.sqrt(STIFFENING * (factor * max(wave_modulus, 0.0) + added) / density) + speed
         return max(1, math.ceil(frame_time * crossing / (config.courant_number * spacing)))
 
     diffusion = viscous_substep(
         spacing=spacing, density=density, viscosity=demand.viscosity, courant_number=config.courant_number
     )
-    own = sound(1.0)
-    count = max(sound(demand.modulus_factor), math.ceil(frame_time / diffusion))
+    own = sound(1.0, 0.0)
+    count = max(sound(demand.modulus_factor, demand.modulus), math.ceil(frame_time / diffusion))
     limit = config.max_substeps_per_frame
     if count > limit:
         if own <= limit:

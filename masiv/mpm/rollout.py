@@ -7,6 +7,7 @@ import torch
 from masiv.effects.active import ActiveEffects
 from masiv.materials.law import Law
 from masiv.mpm.simulator import Simulator
+from masiv.mpm.spring_rollout import SpringRollout
 from masiv.mpm.state import State
 from masiv.mpm.taped_rollout import Adjoint, TapedRollout
 
@@ -16,9 +17,9 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, simulator, law, steps, outputs, effects, position, velocity, affine_velocity, trial_gradient, *rest
+        ctx, simulator, law, steps, outputs, effects, rest, position, velocity, affine_velocity, trial_gradient, *others
     ):
-        state = State(position, velocity, affine_velocity, trial_gradient)
+        state = State(position, velocity, affine_velocity, trial_gradient, rest_position=rest)
         with torch.enable_grad():  # from parameters of effects to coefficients of kernels
             ctx.effects = _detached(effects) if effects is not None else None
             ctx.taped = simulator.run(state, law, steps, outputs, ctx.effects)
@@ -30,7 +31,17 @@ class _Rollout(torch.autograd.Function):
         with torch.enable_grad():  # laws differentiate their networks inside
             adjoint = ctx.taped.backward(positions_bar)
         bars = [bar.to(dtype) for bar, dtype in zip(adjoint.state.tensors(), ctx.dtypes, strict=True)]
-        return None, None, None, None, None, *bars, *adjoint.law, *_effect_gradients(ctx.taped, ctx.effects, adjoint)
+        return (
+            None,
+            None,
+            None,
+            None,
+            None,
+            None,
+            *bars,
+            *adjoint.law,
+            *_effect_gradients(ctx.taped, ctx.effects, adjoint),
+        )
 
 
 def _detached(effects: ActiveEffects) -> ActiveEffects:
@@ -39,7 +50,7 @@ def _detached(effects: ActiveEffects) -> ActiveEffects:
 
 
 def _effect_gradients(
-    taped: TapedRollout, effects: ActiveEffects | None, adjoint: Adjoint
+    taped: TapedRollout | SpringRollout, effects: ActiveEffects | None, adjoint: Adjoint
 ) -> list[torch.Tensor | None]:
     """Gradients of the effects' parameters, from the adjoints of coefficients, masses and forces."""
     if effects is None:
@@ -74,7 +85,8 @@ def rollout(
     NonFiniteError.
     """
     thetas = [theta for _, theta in effects.members] if effects is not None else []
-    return _Rollout.apply(simulator, law, steps, outputs, effects, *initial.tensors(), *law.parameters(), *thetas)
+    given = (simulator, law, steps, outputs, effects, initial.rest_position)
+    return _Rollout.apply(*given, *initial.tensors(), *law.parameters(), *thetas)
 
 
 def at_rest(position: torch.Tensor, velocity: torch.Tensor, affine_velocity: torch.Tensor) -> State:

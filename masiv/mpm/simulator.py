@@ -1,10 +1,11 @@
-"""MLS-MPM of one body: constants, capacities and the start of a rollout."""
+"""The simulator of one body: constants, capacities and the start of a rollout, by MLS-MPM or of springs."""
 
 from __future__ import annotations
 
 import functools
 import itertools
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,8 +14,12 @@ from masiv import runtime
 from masiv.effects.active import ActiveEffects
 from masiv.errors import InputError
 from masiv.materials.law import Law
+from masiv.mpm.spring_rollout import SpringRollout
 from masiv.mpm.state import State
 from masiv.mpm.taped_rollout import Constants, TapedRollout
+
+if TYPE_CHECKING:
+    from masiv.kernels.mpm import MpmKernels
 
 CONTACTS = ("sticky", "release", "slip", "none")
 PARTICLES_UNIT, SUBSTEPS_UNIT = 1024, 64
@@ -84,6 +89,8 @@ class Simulator:
             raise InputError(f"simulator: unknown contact '{contact}', use one of {', '.join(CONTACTS)}")
         if dtype not in (torch.float32, torch.float64):
             raise InputError(f"simulator: dtype {dtype}, give torch.float32 or torch.float64")
+        if dtype == torch.float64:
+            runtime.check_float64("simulator: dtype torch.float64")
         self.count = particle_count
         self.spacing = spacing
         self.substep = substep
@@ -97,11 +104,17 @@ class Simulator:
             contact=CONTACTS.index(contact),
         )
         self.mass = torch.full((particle_count,), density * volume / particle_count, dtype=dtype)
-        real, size = ("f64", 8) if dtype == torch.float64 else ("f32", 4)
-        particles = _round_up(particle_count, PARTICLES_UNIT)
-        affordable = max(8, memory_mb * 1_000_000 // (size * floats_a_substep(particles)))
-        steps = min(_round_up(max_substeps, SUBSTEPS_UNIT), 1 << int(math.log2(affordable)))
-        self.kernels = _shared_kernels(real, steps, particles, grid_nodes, chunks)
+        self._memory_mb, self._max_substeps = memory_mb, max_substeps
+        self._grid_nodes, self._chunks = grid_nodes, chunks
+
+    @functools.cached_property
+    def kernels(self) -> MpmKernels:
+        """Those of MLS-MPM for the body's capacity, made if a rollout needs them."""
+        real, size = ("f64", 8) if self.dtype == torch.float64 else ("f32", 4)
+        particles = _round_up(self.count, PARTICLES_UNIT)
+        affordable = max(8, self._memory_mb * 1_000_000 // (size * floats_a_substep(particles)))
+        steps = min(_round_up(self._max_substeps, SUBSTEPS_UNIT), 1 << int(math.log2(affordable)))
+        return _shared_kernels(real, steps, particles, self._grid_nodes, self._chunks)
 
     def run(
         self,
@@ -111,7 +124,7 @@ class Simulator:
         outputs: list[int],
         effects: ActiveEffects | None = None,
         time: float = 0.0,
-    ) -> TapedRollout:
+    ) -> TapedRollout | SpringRollout:
         """Simulate ``steps`` substeps from ``initial``.
 
         outputs: the substeps (ascending, 0 is the start) whose positions are wanted. time [s] of the start, for effects
@@ -128,7 +141,12 @@ class Simulator:
             raise InputError(
                 f"effects are of a body of {len(effects.context.rest)} particles, the simulator is of {self.count}"
             )
-        rollout = TapedRollout(self.kernels, self.constants, self.mass, law, steps, outputs, effects, time)
+        rollout: TapedRollout | SpringRollout
+        if law.kind == "springs":
+            memory = self._memory_mb
+            rollout = SpringRollout(self.constants, self.mass, law, steps, outputs, effects, time, memory)
+        else:
+            rollout = TapedRollout(self.kernels, self.constants, self.mass, law, steps, outputs, effects, time)
         rollout.forward(initial)
         return rollout
 

@@ -14,12 +14,17 @@ _SHAPES = {"position": (3,), "velocity": (3,), "affine_velocity": (3, 3), "trial
 @dataclass(frozen=True)
 class State:
     """Particles at one instant, simulation frame: position, velocity (N, 3) [m, m/s]; affine_velocity (N, 3, 3) [1/s];
-    trial_gradient (N, 3, 3), the elastic deformation gradient before the return mapping."""
+    trial_gradient (N, 3, 3), the elastic deformation gradient before the return mapping. internal_variables (N, K) of
+    the effect that has some (``HistoryEffect``); None: the body has been in its shape for long. rest_position
+    (N, 3) [m]: where the particles of a body of springs are at rest; None: at ``position``. A rollout has no gradient
+    by these two."""
 
     position: torch.Tensor
     velocity: torch.Tensor
     affine_velocity: torch.Tensor
     trial_gradient: torch.Tensor
+    internal_variables: torch.Tensor | None = None
+    rest_position: torch.Tensor | None = None
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
         return self.position, self.velocity, self.affine_velocity, self.trial_gradient

@@ -6,7 +6,7 @@ A substep maps the state $z_s = (x, v, C, F)$ of the particles to $z_{s+1}$ (``m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -95,7 +95,11 @@ class TapedRollout:
     def forward(self, initial: State) -> None:
         """Simulate from ``initial``. Raises NonFiniteError."""
         self._write_constants()
-        state = State(*(t.detach().to(self.dtype).contiguous() for t in initial.tensors()))
+        known = initial.internal_variables
+        state = State(
+            *(t.detach().to(self.dtype).contiguous() for t in initial.tensors()),
+            internal_variables=None if known is None else known.detach().to(self.dtype).contiguous(),
+        )
         length = min(self.kernels.capacity_steps, self.steps)
         for start in range(0, self.steps, length):
             segment = Segment(start, min(length, self.steps - start), state)
@@ -112,7 +116,7 @@ class TapedRollout:
         """The state at local substep s of the segment that is in the fields."""
         out = State.empty(self.count, self.dtype)
         self.kernels.read_state(s, *out.tensors())
-        return out
+        return replace(out, internal_variables=self.effects.read_internal(s))
 
     def read_stress(self, s: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Elastic deformation gradient and Kirchhoff stress [Pa], (N, 3, 3), in local substep s of the segment that is
@@ -129,13 +133,15 @@ class TapedRollout:
         """Fill the fields with the states of ``segment``, which they then belong to."""
         self.kernels.owner = self
         self.kernels.write_state(0, *segment.initial.tensors())
+        self.effects.write_internal(segment.initial.internal_variables, segment.start == 0)
         for begin in range(0, segment.length, WINDOW_EVERY):
             self._block(segment, begin, min(begin + WINDOW_EVERY, segment.length))
 
     def _block(self, segment: Segment, begin: int, end: int) -> None:
         """Local substeps begin … end - 1 in one window; a second time in the largest one, if particles leave it."""
         constants = self.constants
-        known, outside = self.tape.window(segment.start + begin), 0
+        known = self.tape.window(segment.start + begin)
+        outside: tuple[int, int] | None = None
         for max_margin in (False, True):
             window = known or fit_window(
                 self.kernels, begin, self.count, constants.substep, constants.spacing, max_margin=max_margin
@@ -144,24 +150,23 @@ class TapedRollout:
             self.tape.add_block(segment, begin, end, window)
             self._substeps(segment, begin, end, window.nodes)
             too_fast, outside = self.kernels.read_errors()
-            if too_fast >= 0:
-                raise NonFiniteError(
-                    segment.start + (too_fast >> 32), too_fast & 0xFFFFFFFF, "non-finite or faster than a cell"
-                )
-            if outside < 0:
+            if too_fast is not None:
+                raise NonFiniteError(segment.start + too_fast[0], too_fast[1], "non-finite or faster than a cell")
+            if outside is None:
                 return
-        raise NonFiniteError(segment.start + (outside >> 32), outside & 0xFFFFFFFF, "non-finite position")
+        assert outside is not None
+        raise NonFiniteError(segment.start + outside[0], outside[1], "non-finite position")
 
     def _substeps(self, segment: Segment, begin: int, end: int, nodes: int) -> None:
-        serial = self.count <= SERIAL_PARTICLES  # for any number of threads: the two kernels round differently
+        # For any number of threads: the two kernels round differently.
+        serial = not self.kernels.gpu and self.count <= SERIAL_PARTICLES
         # With several threads a launch is for one substep: three with effects are not worth a kernel of all of it.
-        fused = serial or self.effects.empty
+        fused = serial or self.kernels.gpu or self.effects.empty
         whole = self.bound.substeps(self.kernels, self.effects.forward, serial) if fused else None
         if whole is not None:
             at_once = end - begin if serial else 1
             for s in range(begin, end, at_once):
-                log = self.tape.log_entry(s, nodes)
-                whole.advance(s, s + at_once, self.count, nodes, log, self._time(segment, s))
+                whole.advance(s, s + at_once, self.count, nodes, self.tape.log_entry(s, nodes), self._time(segment, s))
             return
         for s in range(begin, end):
             self._substep(s, self._time(segment, s), nodes)
@@ -175,7 +180,7 @@ class TapedRollout:
     def _substep(self, s: int, time: float, nodes: int) -> None:
         """The state at local substep s -> that at s + 1."""
         self.effects.p2g(self.bound, s, nodes)
-        self.effects.grid_update(self.tape.log_offset(s, nodes), time)
+        self.effects.grid_update(self.tape.log_offset(s, nodes), nodes, time)
         self.kernels.g2p(s, self.count)
         self.effects.apply_forces(s)
 

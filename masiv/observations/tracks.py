@@ -24,13 +24,14 @@ class TracksObservation(Observation):
     """A run from its release (or first frame) on: all of it is fitted, or is for validation, or for the test.
 
     body, condition: as in the scene. axes: which of x, y, z were measured. skipped [s]: time after the release that is
-    left out.
+    left out. held_straight: the body has its rest shape before the release.
     """
 
     body: str
     condition: str
     axes: tuple[int, ...]
     skipped: float = 0.0
+    held_straight: bool = True
 
     @property
     def fitted(self) -> bool:
@@ -75,7 +76,7 @@ def marker_observation(
     return TracksObservation(
         name=run.name, times=times, points=points, values=positions,
         noise_std=noise, residual_std=np.full(len(times), noise), body=run.body, condition=run.condition,
-        axes=(0, 1, 2), skipped=skipped, **_counts(run.purpose, len(times)),
+        axes=(0, 1, 2), skipped=skipped, held_straight=run.held_straight, **_counts(run.purpose, len(times)),
     )  # fmt: skip
 
 

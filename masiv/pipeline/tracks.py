@@ -96,6 +96,7 @@ class TracksRun(Run):
             return self._identify(progress)
 
     def _identify(self, progress: Progress) -> Summary:
+        from masiv.identifiability.held_tracks import held_problems
         from masiv.identification.from_tracks import identify_tracks
         from masiv.report.numbers import given_or_error
 
@@ -115,14 +116,17 @@ class TracksRun(Run):
                 twin.save(self.path)
         rows = self._report(twin, progress)
         law = law_entry(twin)
+        problems = held_problems(self.tracks)
         data = {
-            "run": str(self.path), "report": str(self.folder.report), "law": law, "families": families, "runs": rows
+            "run": str(self.path), "report": str(self.folder.report), "law": law, "families": families, "runs": rows,
+            "problems": problems,
         }  # fmt: skip
         lines = [f"law      {law['kind']}"]
         for name, row in law["parameters"].items():
             error = given_or_error(row["stderr"])
             lines.append(f"         {name.replace('_', ' ')} {row['value']:.4g} {row['unit']}" + error)
-        return Summary(data, "\n".join([*lines, *_table(rows), f"report   {self.folder.report}"]))
+        lines += [*_table(rows), *(f"problem  {problem}" for problem in problems), f"report   {self.folder.report}"]
+        return Summary(data, "\n".join(lines))
 
     def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:
         refuse(request, ("second_run", "relearn"), "pictures", self.scene_path)
@@ -132,6 +136,7 @@ class TracksRun(Run):
             return self._refine(request, progress)
 
     def _refine(self, request: RefineRequest, progress: Progress) -> Summary:
+        from masiv.identifiability.held_tracks import held_problems
         from masiv.refinement.document import document
         from masiv.refinement.document_text import text
         from masiv.refinement.from_tracks import refine_tracks
@@ -147,7 +152,8 @@ class TracksRun(Run):
             self.tracks, twin, self.config.refine, self.config.tracks, self.config.simulator,
             condition=request.condition, dry_run=request.dry_run, folder=self._rollout_cache, progress=progress,
         )  # fmt: skip
-        written = document(result)
+        runs = tuple(r for r in self.tracks.runs if request.condition in (None, r.condition))
+        written = {**document(result), "problems": held_problems(self.tracks, runs)}
         stem = refine_stem(request.condition, first)
         if request.dry_run:
             write_json(self.path / f"{stem}.dry_run.json", written)

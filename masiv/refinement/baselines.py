@@ -14,7 +14,7 @@ from masiv.inference.least_squares import linearize, with_start_values
 from masiv.inference.model_fit import ModelFit, evaluate_fit, gauss_newton_fit, residual_of
 from masiv.inference.robust import robust_scale_of
 from masiv.models.base import Model
-from masiv.models.families import FAMILIES
+from masiv.models.families import CONTINUUM_FAMILIES, FAMILIES
 from masiv.models.free_body import FreeBodyModel
 from masiv.models.initial_state import InitialState
 from masiv.progress import Progress, silent
@@ -52,7 +52,7 @@ def baselines(
     If more than ``config.families`` laws may compete, those best in a short fit on ``problem.coarser`` do. They are
     fitted on ``problem.coarse``, then to all observations. Raises MasivError if no law explains the motion.
     """
-    kinds = [n for n in FAMILIES if not config.laws or n in config.laws]
+    kinds = [n for n in FAMILIES if n in (config.laws or CONTINUUM_FAMILIES)]
     progress(LABEL, 0, len(kinds), ", ".join(kinds))
     if len(kinds) > config.families:
         kinds = _shortlist(forward_model, problem, kinds, config, progress, workers)

@@ -26,6 +26,11 @@ class RefineConfig(BaseModel):
         description="processes that fit effects in parallel; 0: one for each core that Taichi may use, four at most; "
         "on a GPU always one",
     )  # fmt: skip
+    scheduler: str = Field(
+        "", pattern=r"^$|^(tcp|tls|ucx)://\S+$",
+        description="address of a Dask scheduler, as tcp://host:8786, in place of processes: candidates are "
+        "fitted there",
+    )  # fmt: skip
     particles: int = Field(1500, ge=100, description="particles of the rollouts; of tracks: tracks.particles")
     search_particles: int = Field(500, ge=100, description="particles of the short fits that choose the laws")
     samples_per_frame: int = Field(
@@ -33,7 +38,9 @@ class RefineConfig(BaseModel):
     )
     families: int = Field(2, ge=1, description="classical laws that compete, the best by their fit without any effect")
     laws: list[str] = Field([], description="families that compete; all if empty")
-    effects: list[str] = Field([], description="effects that are considered; the whole library if empty")
+    effects: list[str] = Field(
+        [], description="effects that are considered; if empty, the whole library but for effects on request"
+    )  # fmt: skip
     baseline_rollouts: int = Field(45, ge=2, description="rollouts of each stage of a law's fit without effects")
     shortlist: int = Field(4, ge=1, description="effects that are fitted through the rollout, after the ranking")
     max_effects: int = Field(3, ge=1, description="effects that may be added")

@@ -20,7 +20,7 @@ from masiv.refinement.discrepancy_field import peak, sampled_fields, share
 from masiv.refinement.limits import UpperLimit
 from masiv.refinement.result import ADDED, NOTHING, BodyResult, Proposal, RefineResult, SharedFit
 from masiv.refinement.rounds import Round, Trial, alternatives
-from masiv.refinement.support import carried_weight
+from masiv.refinement.support import carried_weight, carried_weight_stderr
 from masiv.refinement.world_vectors import vectors_in_world
 
 SCHEMA = 4
@@ -161,7 +161,8 @@ def _parameters(term: EffectTerm, fitted: ModelFit) -> dict[str, Any]:
 def _accepted(result: RefineResult, term: EffectTerm, fitted: ModelFit) -> dict[str, Any]:
     place = result.places.get(term.name)
     shown = _parameters(term, fitted)
-    carried = carried_weight(term.effect, shown["theta"], result.forward_model.effect_gravity(0))
+    gravity = result.forward_model.effect_gravity(0)
+    carried = carried_weight(term.effect, shown["theta"], gravity)
     others = alternatives(term.name, fitted, result.search.rounds)
     return {
         "effect": term.effect,
@@ -169,6 +170,9 @@ def _accepted(result: RefineResult, term: EffectTerm, fitted: ModelFit) -> dict[
         "bodies": list(term.bodies),
         **shown,
         "carried_weight": carried,
+        "carried_weight_stderr": None
+        if carried is None
+        else carried_weight_stderr(term.effect, shown["stderr"], gravity),
         "world": vectors_in_world(term, fitted.values, fitted.stderr, result.forward_model.effect_axes(0)),
         "indistinguishable_from": list(others),
         "alternatives": others,

@@ -54,7 +54,7 @@ def text(document: Mapping[str, Any]) -> str:
             if q["unit"] != "1"
         ]
         if a["carried_weight"] is not None:
-            lines.append(f"  {question(a['carried_weight'])}")
+            lines.append(f"  {question(a['carried_weight'], a.get('carried_weight_stderr'))}")
     lines.append(f"before {_parts_mm(before)}; after {_parts_mm(after)}")
     force = shown["discrepancy_force"]
     if force is not None:
@@ -83,6 +83,7 @@ def text(document: Mapping[str, Any]) -> str:
             f"{_vector(n['initial_velocity'])} m/s with a spin of {_vector(n['initial_omega'])} rad/s would set them "
             f"{n['predicted_difference_mm']:.0f} mm apart"
         )
+    lines += [f"problem: {problem}" for problem in shown.get("problems", ())]
     return "\n".join([*lines, answer(shown)])
 
 

@@ -72,6 +72,8 @@ def check_config(config: RefineConfig) -> None:
             raise InputError(f"refine.{key} is for scenes of pictures: leave it out, tracks have {instead}")
     if config.processes > 1:
         raise InputError("refine.processes: tracks are simulated in one process: leave it out, or give 1")
+    if config.scheduler:
+        raise InputError("refine.scheduler: tracks are simulated in one process: leave it out")
 
 
 def refine_group(tracks: Tracks, group: str, settings: SearchSettings) -> RefineResult:

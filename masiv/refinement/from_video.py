@@ -20,7 +20,7 @@ from masiv.refinement.result import RefineResult
 from masiv.refinement.search_state import SearchSettings
 from masiv.refinement.stage import check_effects, refine
 from masiv.scene.scene import Scene
-from masiv.workers import Workers, process_count
+from masiv.workers import workers_for
 
 COMPETITORS = {
     "jelly": ("neo_hookean", "von_mises"),
@@ -82,7 +82,7 @@ def refine_recordings(
     start = RENAMED_STARTS.get(start or "", start)
     if not config.laws and start in COMPETITORS:
         config = config.model_copy(update={"laws": list(COMPETITORS[start])})
-    with runtime.torch_threads(1), Workers(process_count(config.processes)) as workers:
+    with runtime.torch_threads(1), workers_for(config.processes, config.scheduler) as workers:
         prepared = [
             prepare(r.name, r.scene, first_frames(r.motion, r.fit_frames), r.whole, identify, simulator, config)
             for r in with_unique_names(recordings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -155,21 +156,26 @@ class Posterior:
     """Probabilities of ``hypotheses``. Sets of as many effects are equally likely beforehand, and one effect more is
     half as likely in all (Scott & Berger 2010); so are laws.
 
-    candidates: effects that could act, of which the sets are drawn.
+    candidates: causes that could act, of which the sets are drawn. shapes: how many shapes the cause of an effect has,
+    all equally likely; one if not given.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     probabilities: tuple[float, ...]
 
     @classmethod
-    def of(cls, hypotheses: Sequence[Hypothesis], candidates: int) -> Posterior:
+    def of(
+        cls, hypotheses: Sequence[Hypothesis], candidates: int, shapes: Mapping[str, int] = MappingProxyType({})
+    ) -> Posterior:
         best: dict[tuple[frozenset[str], str], Hypothesis] = {}
         for h in hypotheses:
             key = (h.effects, h.law)
             if key not in best or h.marginal.log_evidence > best[key].marginal.log_evidence:
                 best[key] = h
         kept = tuple(best.values())
-        logs = np.array([h.marginal.log_evidence + log_prior(len(h.effects), candidates) for h in kept])
+        of_shapes = [sum(math.log(shapes.get(name, 1)) for name in h.effects) for h in kept]
+        of_sets = [log_prior(len(h.effects), candidates) for h in kept]
+        logs = np.array([h.marginal.log_evidence for h in kept]) + of_sets - of_shapes
         shares = np.exp(logs - logs.max())
         return cls(kept, tuple(float(p) for p in shares / shares.sum()))
 

@@ -29,6 +29,8 @@ MIN_ROBUST_SCALE = 5.0
 observation has its own ``noise_std``, and noise is no outlier in any of them."""
 WHITENING_PASSES = 2
 """How often the best law is chosen: the one that is best before ``residual_std`` is known may not be it."""
+SUBSTEP_PASSES = 4
+"""How often a law is fitted, with shorter substeps each time: from one to the next its modulus may double."""
 RIVALS = 1
 """Further models on top of which one effect more is looked for: effects take each other over."""
 
@@ -83,8 +85,7 @@ def whitened_start(
             MIN_ROBUST_SCALE * max(e.noise_std for e in whitened.observations),
         )
         settings.progress("refine: fit whitened residuals", 0, 1, "")
-        tasks = [(base, BROYDEN_STEPS, scale) for base in baselines]
-        again = rank_by_bic(fits_of(map_tasks(settings.workers, whitened, refit_whitened, tasks)))
+        again = rank_by_bic(_fitted_again(whitened, baselines, scale, settings.workers))
         settings.progress("refine: fit whitened residuals", 1, 1, "")
         laws = again[: settings.config.families]
         state = replace(state, forward_model=whitened, robust_scale=scale)
@@ -92,6 +93,23 @@ def whitened_start(
             break
         first = laws[0]
     return state.with_fit(laws[0]), laws
+
+
+def _fitted_again(
+    forward_model: ForwardModel, baselines: Sequence[ModelFit], robust_scale: float, workers: Workers
+) -> list[ModelFit]:
+    """``refit_whitened`` of ``baselines``; those that the substep stopped, again with shorter ones."""
+    fits: list[ModelFit] = []
+    todo = list(baselines)
+    for left in reversed(range(SUBSTEP_PASSES)):
+        tasks = [(base, BROYDEN_STEPS, robust_scale) for base in todo]
+        todo = []
+        for fit in fits_of(map_tasks(workers, forward_model, refit_whitened, tasks)):
+            stopped = left > 0 and forward_model.shorten_substeps(fit.model, fit.values)
+            (todo if stopped else fits).append(fit)
+        if not todo:
+            break
+    return fits
 
 
 def fits_of(results: Iterable[ModelFit | TaskError]) -> list[ModelFit]:

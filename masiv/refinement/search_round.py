@@ -94,8 +94,9 @@ def _judged(
         replace(t, log_bayes_factor=known.get(id(t.fitted)), not_weighed=failed.get(id(t.fitted))) for t in trials
     ]
     trials.sort(key=lambda t: -math.inf if t.log_bayes_factor is None else t.log_bayes_factor, reverse=True)
-    count = len(settings.considered(state.forward_model, state.fit.model)) + len(state.fit.model.effects)
-    posterior = Posterior.of(hypotheses, count)
+    causes = settings.causes(state.forward_model, state.fit.model)
+    shapes = {name: len(cause) for cause in causes for name in cause}
+    posterior = Posterior.of(hypotheses, len(causes), shapes)
     fewer = len(state.fit.model.effects)
     chosen = posterior.best(fewer + 1)
     accepted = None

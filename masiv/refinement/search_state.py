@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from masiv.effects.catalogue import cause_of, effect_named
 from masiv.inference.discretization import with_residual_std
 from masiv.inference.model_fit import ModelFit, warm_started_fit
 from masiv.inference.noise_model import NoiseModel
@@ -21,13 +22,15 @@ from masiv.workers import TaskError, Workers, unwrap
 @dataclass(frozen=True)
 class SearchSettings:
     """config: see ``RefineConfig``; max_effects, shortlist: its values unless given. rank_only: rank the effects, fit
-    none. discrepancy_force: if much stays unexplained, fit a smooth force for it."""
+    none. discrepancy_force: if much stays unexplained, fit a smooth force for it. all_shapes: who names a cause asks
+    for all shapes of it."""
 
     config: RefineConfig
     max_effects: int
     shortlist: int
     rank_only: bool = False
     discrepancy_force: bool = True
+    all_shapes: bool = True
     workers: Workers = field(default_factory=Workers)
     progress: Progress = silent
     linearizations: Linearizations = field(default_factory=Linearizations)
@@ -39,22 +42,44 @@ class SearchSettings:
     ) -> SearchSettings:  # fmt: skip
         """As ``config`` has them."""
         return cls(
-            config, config.max_effects, config.shortlist, rank_only, discrepancy_force,
+            config, config.max_effects, config.shortlist, rank_only, discrepancy_force, True,
             workers or Workers(), progress, Linearizations(workers),
         )  # fmt: skip
 
     def for_effects(self, effects: Sequence[str]) -> SearchSettings:
-        """With ``effects`` alone, whatever part of the residual they explain."""
+        """With ``effects`` alone, and no other shapes of them, whatever part of the residual they explain."""
         config = self.config.model_copy(update={"effects": sorted(set(effects)), "min_explained": 0.0})
-        return replace(self, config=config)
+        return replace(self, config=config, all_shapes=False)
 
     def considered(self, forward_model: ForwardModel, model: Model) -> list[str]:
-        """Terms that may be added to ``model``, of the effects that the configuration names, in its order."""
+        """Terms that may be added to ``model``, of the effects that the configuration names, in its order, and of their
+        other shapes; if it names none, of all but those on request."""
+        present = {forward_model.term(n).effect for n in model.effects}
+        return [
+            n
+            for n in self._wanted(forward_model, model)
+            if not any(e != (own := forward_model.term(n).effect) and cause_of(e) == cause_of(own) for e in present)
+        ]
+
+    def causes(self, forward_model: ForwardModel, model: Model) -> list[list[str]]:
+        """The causes that may act, those in ``model`` included: of each, its shapes by the names of their terms."""
+        found: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+        for name in (*self._wanted(forward_model, model), *model.effects):
+            term = forward_model.term(name)
+            found.setdefault((cause_of(term.effect), term.bodies), []).append(name)
+        return list(found.values())
+
+    def _wanted(self, forward_model: ForwardModel, model: Model) -> list[str]:
         names = forward_model.candidates(model)
         wanted = self.config.effects
         if not wanted:
-            return list(names)
-        own = [(wanted.index(e), n) for n in names if (e := forward_model.term(n).effect) in wanted]
+            return [n for n in names if not effect_named(forward_model.term(n).effect).hints.on_request]
+        own = []
+        for name in names:
+            effect = forward_model.term(name).effect
+            asked = [n for n in (effect, *([cause_of(effect)] if self.all_shapes else [])) if n in wanted]
+            if asked:
+                own.append((wanted.index(asked[0]), name))
         return [name for _, name in sorted(own, key=lambda pair: pair[0])]
 
 

@@ -7,21 +7,23 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 
+from masiv.effects.directions import direction
 from masiv.models.base import EffectTerm
 from masiv.scene.transforms import SimulationFrame
 
 COMPONENT = re.compile(r"^(?:(?P<stem>.+)_)?(?P<axis>[xyz])(?P<body> of .+)?$")
 """``acceleration_x``, or ``x`` of a place; of one of several bodies."""
-PLACE, AXIS = "place", "axis"
+PLACE, AXIS, INCLINATION, DIRECTION = "place", "axis", "inclination", "direction"
 
 
 def vectors_in_world(
     term: EffectTerm, values: Mapping[str, float], errors: Mapping[str, float], axes: SimulationFrame
 ) -> dict[str, Any]:
     """Of ``term``, by name: ``value`` (3,), ``stderr`` (3,) or None, ``unit``; components of an error are taken as
-    independent. A place without a height is that of a vertical axis: then ``axis`` is its direction, without a unit.
-    Empty if the effect has no direction and no place."""
+    independent. A place without a height is that of a vertical axis: then ``axis`` is its direction, without a unit. So
+    is ``direction`` for an inclination (``masiv.effects.directions``). Empty if the effect has none of these."""
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for p in term.parameters:
         found = COMPONENT.match(p.name.removeprefix(f"{term.name}."))
@@ -36,6 +38,10 @@ def vectors_in_world(
         if stem == PLACE and "y" not in names:
             upwards = axes.vectors_to_world(np.array([0.0, 1.0, 0.0]))
             out[f"{AXIS}{body}"] = {"value": upwards.tolist(), "stderr": None, "unit": "1"}
+        if stem == INCLINATION:
+            unit_vector = direction(torch.tensor([values[names["x"]], values[names["z"]]], dtype=torch.float64))
+            turned_vector = axes.vectors_to_world(unit_vector.numpy())
+            out[f"{DIRECTION}{body}"] = {"value": turned_vector.tolist(), "stderr": None, "unit": "1"}
     return out
 
 

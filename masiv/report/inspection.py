@@ -18,10 +18,12 @@ from masiv.identifiability.answers import Identifiability, identifiability
 from masiv.identifiability.fall import fall_problem, wrong_scale
 from masiv.identifiability.from_scene import scene_motion
 from masiv.identifiability.from_tracks import track_motion
+from masiv.identifiability.held_tracks import held_problems
 from masiv.identifiability.motion import ObservedMotion
 from masiv.observations.identity import identity
 from masiv.report.contact_sheet import Marks, write_contact_sheet
 from masiv.report.world_marks import round_length
+from masiv.scene.frame_cache import Frame
 from masiv.scene.scene import Scene
 from masiv.scene.summary import as_text, summarise
 from masiv.tracks.summary import summarise_tracks, tracks_as_text, write_tracks_picture
@@ -36,11 +38,13 @@ def inspection(read: Scene | Tracks, picture: Path) -> tuple[dict[str, Any], str
         motions = [found for run in read.runs if (found := track_motion(read, run)) is not None]
         for motion in motions:
             summary["problems"] += _fall_problems(motion, motion.times, motion.centre, f"run {motion.name}: ")
+        summary["problems"] += held_problems(read)
         return _with_answers(summary, motions, tracks_as_text)
-    summary = {**summarise(read), **identity(read), "picture": str(picture)}
+    looked = _Looked(read)
+    summary = {**summarise(read, looked.at), **identity(read), "picture": str(picture)}
     path, notes = None, {}
     if read.cameras:
-        path, notes = _inspect_cameras(read, summary)
+        path, notes = _inspect_cameras(read, looked, summary)
     first = first_frame_problems(read)
     summary["problems"] += first
     motion = scene_motion(read, path)
@@ -80,19 +84,17 @@ def _fall_problems(motion: ObservedMotion, times: np.ndarray, centre: np.ndarray
     return [] if wrong is None else [who + wrong]
 
 
-def _inspect_cameras(scene: Scene, summary: dict[str, Any]) -> tuple[tuple[np.ndarray, np.ndarray], dict[int, str]]:
+def _inspect_cameras(
+    scene: Scene, looked: _Looked, summary: dict[str, Any]
+) -> tuple[tuple[np.ndarray, np.ndarray], dict[int, str]]:
     """Numbers and problems of cameras and masks into ``summary``; frames (K,) and path (K, 3) [m] of the object, and
     a note for each view."""
     cameras = [scene.cameras[view] for view in scene.views]
-    outlines, holes = _outlines(scene)
+    outlines, holes = looked.outlines, looked.holes
     series = tangency_series(cameras, outlines)
     agreement = consistency(scene.views, pairs_of(series))
     quality = mask_quality(scene)
-    # Masks that were made to agree with each other agree at a wrong time, too.
-    raw = outlines if scene.correct_masks is None else [
-        [outline(scene.load(view, frame)) for frame in range(scene.frame_count)] for view in scene.views
-    ]  # fmt: skip
-    found, flickers = clocks(scene.views, cameras, raw, scene.fps), flicker(scene.views, series, holes)
+    found, flickers = clocks(scene.views, cameras, looked.raw, scene.fps), flicker(scene.views, series, holes)
     rows = summary["cameras"]
     for k, view in enumerate(scene.views):
         rows[view]["consistency_px"] = _plain(agreement.pixels[k])
@@ -112,19 +114,28 @@ def _inspect_cameras(scene: Scene, summary: dict[str, Any]) -> tuple[tuple[np.nd
     return (frames, centres), notes
 
 
-def _outlines(scene: Scene) -> tuple[list[list[Outline | None]], np.ndarray]:
-    """Outlines, a list for each view, and ``hole_share`` (V, F) of each mask."""
-    outlines, holes = [], np.full((len(scene.views), scene.frame_count), np.nan)
-    for row, view in enumerate(scene.views):
-        outlines.append([])
-        masks: list[np.ndarray] = []
-        for frame in range(scene.frame_count):
-            picture = scene.frame(view, frame)
-            outlines[-1].append(outline(picture))
-            masks = [*masks[-2:], picture.mask]
-            if len(masks) == 3:
-                holes[row, frame - 1] = hole_share(*masks)
-    return outlines, holes
+class _Looked:
+    """What is kept of each picture of ``scene``. By view, then by frame: outlines, and raw, those of the masks before
+    they are made to agree (masks that agree with each other agree at a wrong time, too); holes (V, F): ``hole_share``.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._row = {view: row for row, view in enumerate(scene.views)}
+        self.outlines: list[list[Outline | None]] = [[] for _ in scene.views]
+        self.raw = self.outlines if scene.correct_masks is None else [[] for _ in scene.views]
+        self.holes = np.full((len(scene.views), scene.frame_count), np.nan)
+        self._last: list[list[np.ndarray]] = [[] for _ in scene.views]
+
+    def at(self, view: int, frame: int, picture: Frame) -> None:
+        """Look at ``picture``; frames come in order."""
+        row = self._row[view]
+        self.outlines[row].append(outline(picture))
+        if self.raw is not self.outlines:
+            self.raw[row].append(outline(self._scene.load(view, frame)))
+        last = self._last[row] = [*self._last[row][-2:], picture.mask > 0.5]
+        if len(last) == 3:
+            self.holes[row, frame - 1] = hole_share(*last)
 
 
 def _plain(value: float) -> float | None:

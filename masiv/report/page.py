@@ -79,6 +79,11 @@ class Page:
         body = "".join("<tr>" + "".join(_cell(value) for value in row) + "</tr>" for row in rows)
         self.parts.append(f'<div class="scroll"><table><tr>{head}</tr>{body}</table></div>')
 
+    def links(self, links: Sequence[tuple[str, str]]) -> None:
+        """A list of texts with their addresses."""
+        shown = "".join(f'<li><a href="{html.escape(address)}">{html.escape(text)}</a></li>' for text, address in links)
+        self.parts.append(f"<ul>{shown}</ul>")
+
     def picture(self, png: bytes, alt: str) -> None:
         self.pictures([(png, alt)])
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from masiv.identifiability.held_tracks import held_problems
 from masiv.report.charts import BLACK, BLUE, COLOURS, ORANGE, Chart, Line
 from masiv.report.motion_view import Motion
 from masiv.report.page import Page
@@ -39,6 +40,8 @@ def write_report(
     page = Page(f"Digital twin of {tracks.path.resolve().name}")
     bodies = ", ".join(tracks.bodies)
     page.note(f"Measured points, no pictures. Bodies: {bodies}. {len(tracks.runs)} recordings.")
+    for problem in held_problems(tracks):
+        page.note(f"Problem: {problem}.")
     added = any(document["accepted"] for document in refined)
     page.cards(answer_cards(twin, None, refined, [] if added else _agreements(runs)))
     if curves:

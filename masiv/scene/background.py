@@ -11,6 +11,7 @@ Pictures are (H, W, 3) RGB, masks (H, W) float32 in [0, 1].
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -39,6 +40,12 @@ _NEAR = 17
 """Diameter of the neighbourhood of the object [pixels], in which JPEG noise is larger: a block of 4:2:0 is 16 wide."""
 _SMALLEST_COMPONENT = 0.02
 _ROUNDS = 2
+_MAX_SAMPLES = 2_000_000
+"""Pixels from which a covariance is estimated, at most: its relative error is then 0.1 %."""
+_MAX_LIGHT_SAMPLES = 100_000
+"""Pixels to which the gain and offset of a picture are fitted, at most."""
+_MAX_COARSE = 500_000
+"""Pixels of the picture in which the object is looked for, at most; a larger picture is reduced for that."""
 
 
 @dataclass(frozen=True)
@@ -69,17 +76,41 @@ class BackgroundModel:
     def mask(self, view: int, image: np.ndarray) -> np.ndarray:
         """The probability (H, W) float32 that a pixel of ``image`` shows the object; its share at the outline."""
         empty = self.backgrounds[view]
-        picture = _with_light_of(image.astype(np.float32), empty)
-        far = self._log_odds(picture, empty, self.noise.far, _CAST_SD)[0]
+        light = _Light.of(image, empty)
+        mask = np.zeros(image.shape[:2], np.float32)
+        part = self._window_of(image, empty, light)
+        if part is None:
+            return mask
+        picture, behind = light.removed(image[part]), empty[part]
+        far = self._log_odds(picture, behind, self.noise.far, _CAST_SD)[0]
         coarse = largest_components(_blur(far, 1.5) > 0)
         if not coarse.any():
-            return np.zeros(coarse.shape, np.float32)
+            return mask
         near = cv2.dilate(coarse.astype(np.uint8), np.ones((_NEAR, _NEAR), np.uint8))
         x, y, width, height = cv2.boundingRect(near)
         window = (slice(y, y + height), slice(x, x + width))
-        mask = np.zeros(coarse.shape, np.float32)
-        mask[window] = self._near_object(picture[window], empty[window], far[window], near[window] > 0)
+        mask[part][window] = self._near_object(picture[window], behind[window], far[window], near[window] > 0)
         return mask
+
+    def _window_of(self, image: np.ndarray, empty: np.ndarray, light: _Light) -> tuple[slice, slice] | None:
+        """Where the object may be in ``image``: all of a small picture. In a large one it is looked for in a reduced
+        picture, whose pixels are means: their noise is no larger. None if there is nothing."""
+        height, width = image.shape[:2]
+        factor = math.ceil(math.sqrt(height * width / _MAX_COARSE))
+        if factor == 1:
+            return slice(0, height), slice(0, width)
+        size = math.ceil(width / factor), math.ceil(height / factor)
+        picture = light.removed(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        reduced = cv2.resize(empty, size, interpolation=cv2.INTER_AREA)
+        found = largest_components(_blur(self._log_odds(picture, reduced, self.noise.far, _CAST_SD)[0], 1.5) > 0)
+        if not found.any():
+            return None
+        x, y, w, h = cv2.boundingRect(found.astype(np.uint8))
+        margin = 2 * _NEAR
+        return (
+            slice(max(y * factor - margin, 0), min((y + h) * factor + margin, height)),
+            slice(max(x * factor - margin, 0), min((x + w) * factor + margin, width)),
+        )
 
     def _near_object(self, picture: np.ndarray, empty: np.ndarray, far: np.ndarray, near: np.ndarray) -> np.ndarray:
         """``mask`` in a window around the object. ``far``: log-odds by the noise far from it; ``near`` bool."""
@@ -93,7 +124,8 @@ class BackgroundModel:
     def shadow(self, view: int, image: np.ndarray) -> np.ndarray:
         """The probability (H, W) that a pixel of the background is in shadow."""
         empty = self.backgrounds[view]
-        return self._log_odds(_with_light_of(image.astype(np.float32), empty), empty, self.noise.far, _CAST_SD)[1]
+        picture = _Light.of(image, empty).removed(image)
+        return self._log_odds(picture, empty, self.noise.far, _CAST_SD)[1]
 
     def _log_odds(
         self, picture: np.ndarray, empty: np.ndarray, covariance: np.ndarray, cast_sd: float
@@ -113,35 +145,99 @@ class BackgroundModel:
         return on_object - np.logaddexp(light, dark), 1 / (1 + np.exp(np.clip(light - dark, -30, 30)))
 
 
-def learn_background(images: dict[int, np.ndarray], plates: dict[int, np.ndarray]) -> BackgroundModel:
+@dataclass(frozen=True)
+class _Light:
+    """Gain and offset of each channel (3,) of a picture relative to the empty scene, whose mean is ``middle`` (3,)."""
+
+    gain: np.ndarray
+    offset: np.ndarray
+    middle: np.ndarray
+
+    @classmethod
+    def of(cls, picture: np.ndarray, empty: np.ndarray) -> _Light:
+        """A robust line through the pixels: least squares with Cauchy weights. Without contrast in ``empty`` the gain
+        stays near one."""
+        step = max(2, math.ceil(math.sqrt(picture.shape[0] * picture.shape[1] / _MAX_LIGHT_SAMPLES)))
+        lines = []
+        for channel in range(3):
+            x = empty[::step, ::step, channel].ravel().astype(np.float32)
+            lines.append(_line(x, picture[::step, ::step, channel].ravel().astype(np.float32)))
+        return cls(*np.array(lines).T)
+
+    def removed(self, picture: np.ndarray) -> np.ndarray:
+        """``picture`` (H, W, 3) as float32 in the light of the empty scene."""
+        result = np.empty(picture.shape, np.float32)
+        for channel in range(3):
+            gain, offset, middle = (float(v[channel]) for v in (self.gain, self.offset, self.middle))
+            # A pixel of the background has the colour of the empty scene after this.
+            seen = picture[..., channel].astype(np.float32)
+            result[..., channel] = (seen - offset - gain * middle) / max(gain, 0.1) + middle
+        return result
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
+    """Gain, offset of y = gain x + offset, and the mean of x; see ``_Light.of``."""
+    gain, offset = 1.0, float(np.median(y - x))
+    middle = float(x.mean())
+    for _ in range(8):
+        error = y - gain * x - offset
+        scale = 1.4826 * float(np.median(np.abs(error))) + 0.5
+        weight = 1 / (1 + (error / (2 * scale)) ** 2)
+        total = weight.sum()
+        mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
+        # A ridge with the weight of 1 % of the pixels at 30 grey levels keeps a plain background's gain near one.
+        ridge = 0.01 * total * 30.0**2
+        spread = (weight * (x - mean_x) ** 2).sum()
+        gain = float(((weight * (x - mean_x) * (y - mean_y)).sum() + ridge) / (spread + ridge))
+        offset = float(mean_y - gain * mean_x)
+    return gain, offset, middle
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """Some pictures of one view, (H, W, 3) uint8 each, which are floats only while they are looked at: those of many
+    large views would fill the memory."""
+
+    images: Sequence[np.ndarray]
+    lights: Sequence[_Light]
+
+    @classmethod
+    def of(cls, images: Sequence[np.ndarray], plate: np.ndarray) -> _Pictures:
+        return cls(images, [_Light.of(image, plate) for image in images])
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (light.removed(image) for image, light in zip(self.images, self.lights, strict=True))
+
+
+def learn_background(images: Mapping[int, Sequence[np.ndarray]], plates: dict[int, np.ndarray]) -> BackgroundModel:
     """The model of a recording.
 
-    images: pictures (T, H, W, 3) uint8 of each view with the object, some of the recording's. plates: a picture
+    images: pictures (H, W, 3) uint8 of each view with the object, some of the recording's. plates: a picture
     (H, W, 3) uint8 of each view without it.
     """
-    pictures = {
-        view: np.stack([_with_light_of(image.astype(np.float32), plates[view].astype(np.float32)) for image in given])
-        for view, given in images.items()
-    }
-    taken = {view: np.stack([_differs(p, plates[view]) for p in stack]) for view, stack in pictures.items()}
-    masks: dict[int, np.ndarray] = {}
+    pictures = {view: _Pictures.of(given, plates[view]) for view, given in images.items()}
+    taken = {view: [_differs(p, plates[view]) for p in own] for view, own in pictures.items()}
+    masks: dict[int, list[np.ndarray]] = {}
     uniform = np.full((_BINS,) * 3, -3 * math.log(256.0), np.float32)
     log_colours = uniform
     correlated = 1.0
     for learnt in range(_ROUNDS + 1):
-        backgrounds = {view: _background(plates[view], stack, taken[view]) for view, stack in pictures.items()}
+        backgrounds = {view: _background(plates[view], own, taken[view]) for view, own in pictures.items()}
         noise = _noise(pictures, backgrounds, taken, masks)
         if learnt == 0:
             correlated = _correlated_pixels(pictures, backgrounds, taken)
         cast = _shadow_cast(pictures, backgrounds)
-        coverage = np.clip(np.mean([m.mean() for m in (masks or taken).values()]), 1e-3, 0.5)
+        coverage = np.clip(np.mean([np.mean(m) for m in (masks or taken).values()]), 1e-3, 0.5)
         model = BackgroundModel(
             backgrounds, noise, correlated, cast, log_colours, float(np.log(coverage / (1 - coverage)))
         )
         if learnt == _ROUNDS:
             return model
-        masks = {v: np.stack([model.mask(v, p) for p in stack]) for v, stack in pictures.items()}
-        taken = {v: np.maximum(masks[v], [model.shadow(v, p) for p in stack]) > 0.1 for v, stack in pictures.items()}
+        masks = {v: [model.mask(v, p) for p in own] for v, own in pictures.items()}
+        taken = {
+            v: [np.maximum(m, model.shadow(v, p)) > 0.1 for m, p in zip(masks[v], own, strict=True)]
+            for v, own in pictures.items()
+        }
         log_colours = _log_colours(pictures, masks)
     raise AssertionError
 
@@ -180,32 +276,6 @@ def _blur(values: np.ndarray, sd: float) -> np.ndarray:
     return cv2.GaussianBlur(values, (0, 0), sd)
 
 
-def _with_light_of(picture: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """``picture`` with gain and offset of each channel removed, relative to ``empty``.
-
-    A robust line: least squares with Cauchy weights. Without contrast in ``empty`` the gain stays near one.
-    """
-    result = np.empty_like(picture)
-    for channel in range(3):
-        x, y = empty[::2, ::2, channel].ravel(), picture[::2, ::2, channel].ravel()
-        gain, offset = 1.0, float(np.median(y - x))
-        middle = float(x.mean())
-        for _ in range(8):
-            error = y - gain * x - offset
-            scale = 1.4826 * float(np.median(np.abs(error))) + 0.5
-            weight = 1 / (1 + (error / (2 * scale)) ** 2)
-            total = weight.sum()
-            mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
-            # A ridge with the weight of 1 % of the pixels at 30 grey levels keeps a plain background's gain near one.
-            ridge = 0.01 * total * 30.0**2
-            spread = (weight * (x - mean_x) ** 2).sum()
-            gain = float(((weight * (x - mean_x) * (y - mean_y)).sum() + ridge) / (spread + ridge))
-            offset = float(mean_y - gain * mean_x)
-        # A pixel of the background has the colour of ``empty`` after this.
-        result[..., channel] = (picture[..., channel] - offset - gain * middle) / max(gain, 0.1) + middle
-    return result
-
-
 def _differs(picture: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Pixels that differ from the plate by more than its noise, and their neighbours: a first guess, with shadows."""
     difference = np.abs(_blur(picture - plate.astype(np.float32), 1.5)).max(axis=-1)
@@ -213,29 +283,41 @@ def _differs(picture: np.ndarray, plate: np.ndarray) -> np.ndarray:
     return cv2.dilate((difference > limit).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
 
 
-def _background(plate: np.ndarray, pictures: np.ndarray, taken: np.ndarray) -> np.ndarray:
+def _background(plate: np.ndarray, pictures: _Pictures, taken: Sequence[np.ndarray]) -> np.ndarray:
     """Mean of the plate and of the pictures where they show it: less noise than the plate alone has."""
-    free = np.stack([cv2.dilate(t.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0 for t in taken])[..., None]
-    return ((plate + (free * pictures).sum(axis=0)) / (1 + free.sum(axis=0))).astype(np.float32)
+    total, count = np.zeros(plate.shape, np.float32), np.ones(plate.shape[:2], np.float32)
+    for picture, not_free in zip(pictures, taken, strict=True):
+        free = cv2.dilate(not_free.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
+        total += free[..., None] * picture
+        count += free
+    return (plate + total) / count[..., None]
+
+
+def _sample_step(pictures: Mapping[int, Iterable[np.ndarray]]) -> int:
+    """The stride through all pixels that leaves ``_MAX_SAMPLES`` of them, or all if they are fewer."""
+    return math.ceil(
+        sum(picture.shape[0] * picture.shape[1] for own in pictures.values() for picture in own) / _MAX_SAMPLES
+    )
 
 
 def _noise(
-    pictures: dict[int, np.ndarray],
+    pictures: dict[int, _Pictures],
     backgrounds: dict[int, np.ndarray],
-    taken: dict[int, np.ndarray],
-    masks: dict[int, np.ndarray],
+    taken: dict[int, list[np.ndarray]],
+    masks: dict[int, list[np.ndarray]],
 ) -> Noise:
+    step = _sample_step(taken)
+    square = np.ones((_NEAR, _NEAR), np.uint8)
     far, near = [], []
-    for view, stack in pictures.items():
-        residual = stack - backgrounds[view]
-        free = ~taken[view]
-        if view in masks:
-            square = np.ones((_NEAR, _NEAR), np.uint8)
-            zone = np.stack([cv2.dilate((m > 0.5).astype(np.uint8), square) > 0 for m in masks[view]])
-            far.append(residual[free & ~zone])
-            near.append(residual[free & zone])
-        else:
-            far.append(residual[free])
+    for view, own in pictures.items():
+        for k, picture in enumerate(own):
+            residual, free = picture - backgrounds[view], ~taken[view][k]
+            if view in masks:
+                zone = cv2.dilate((masks[view][k] > 0.5).astype(np.uint8), square) > 0
+                far.append(residual[free & ~zone][::step])
+                near.append(residual[free & zone][::step])
+            else:
+                far.append(residual[free][::step])
     far_covariance = _covariance(np.concatenate(far))
     near_residual = np.concatenate(near) if near else np.empty((0, 3))
     enough = len(near_residual) > 1000
@@ -253,12 +335,12 @@ def _covariance(residual: np.ndarray) -> np.ndarray:
 
 
 def _correlated_pixels(
-    pictures: dict[int, np.ndarray], backgrounds: dict[int, np.ndarray], taken: dict[int, np.ndarray]
+    pictures: dict[int, _Pictures], backgrounds: dict[int, np.ndarray], taken: dict[int, list[np.ndarray]]
 ) -> float:
     """Sum of the autocorrelation of the noise over lags up to two pixels, 1 for white noise: of the median view."""
     found = []
-    for view, stack in pictures.items():
-        residual, free = stack[:1] - backgrounds[view], ~taken[view][:1]
+    for view, own in pictures.items():
+        residual, free = next(iter(own)) - backgrounds[view], ~taken[view][0]
         base = max(_correlation(residual, free, 0, 0), 1e-6)
         lags = [(0, 1), (0, 2), *((dy, dx) for dy in (1, 2) for dx in range(-2, 3))]
         found.append(1 + 2 * sum(max(_correlation(residual, free, *lag) / base, 0.0) for lag in lags))
@@ -266,24 +348,24 @@ def _correlated_pixels(
 
 
 def _correlation(residual: np.ndarray, free: np.ndarray, dy: int, dx: int) -> float:
-    height, width = residual.shape[1:3]
-    one = (slice(None), slice(max(0, dy), height + min(0, dy)), slice(max(0, dx), width + min(0, dx)))
-    other = (slice(None), slice(max(0, -dy), height - max(0, dy)), slice(max(0, -dx), width - max(0, dx)))
+    height, width = residual.shape[:2]
+    one = (slice(max(0, dy), height + min(0, dy)), slice(max(0, dx), width + min(0, dx)))
+    other = (slice(max(0, -dy), height - max(0, dy)), slice(max(0, -dx), width - max(0, dx)))
     both = free[one] & free[other]
     limit = 10.0  # grey levels: what is larger is no noise of the background
     first, second = np.clip(residual[one][both], -limit, limit), np.clip(residual[other][both], -limit, limit)
     return float((first * second).mean()) if len(first) else 0.0
 
 
-def _shadow_cast(pictures: dict[int, np.ndarray], backgrounds: dict[int, np.ndarray]) -> np.ndarray:
+def _shadow_cast(pictures: dict[int, _Pictures], backgrounds: dict[int, np.ndarray]) -> np.ndarray:
     """Share of light that shadows take from each channel over its mean, (3,): sky light makes shadows bluish."""
-    taken_light = []
-    for view, stack in pictures.items():
+    taken_light, step = [], _sample_step({view: own.images for view, own in pictures.items()})
+    for view, own in pictures.items():
         empty = np.maximum(_blur(backgrounds[view], 2.0), 4.0)
-        for picture in stack:
+        for picture in own:
             ratio = _blur(picture, 2.0) / empty
             dimmed = (ratio.mean(-1) < 0.93) & (ratio.mean(-1) > 1 - _DEEPEST_SHADOW) & (np.ptp(ratio, axis=-1) < 0.12)
-            taken_light.append(1 - ratio[dimmed])
+            taken_light.append(1 - ratio[dimmed][::step])
     found = np.concatenate(taken_light)
     if len(found) < 100:
         return np.ones(3)
@@ -291,14 +373,14 @@ def _shadow_cast(pictures: dict[int, np.ndarray], backgrounds: dict[int, np.ndar
     return cast / cast.mean()
 
 
-def _log_colours(pictures: dict[int, np.ndarray], masks: dict[int, np.ndarray]) -> np.ndarray:
+def _log_colours(pictures: dict[int, _Pictures], masks: dict[int, list[np.ndarray]]) -> np.ndarray:
     """Log density of the object's colours: a smoothed histogram of the pixels inside of its outline.
 
     Holes count as inside, so that colours which the background hides in one view are learnt there too.
     """
     counts = np.zeros((_BINS,) * 3)
-    for view, stack in pictures.items():
-        for picture, mask in zip(stack, masks[view], strict=True):
+    for view, own in pictures.items():
+        for picture, mask in zip(own, masks[view], strict=True):
             solid = cv2.erode(_filled(mask > 0.5), np.ones((3, 3), np.uint8)) > 0
             bins = np.clip(picture[solid] * (_BINS / 256), 0, _BINS - 1).astype(np.int64)
             flat = np.ravel_multi_index(tuple(bins.T), counts.shape)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-MAX_BYTES = 2 << 30
+MAX_BYTES = 1 << 30
 """Of the frames that one scene keeps [bytes]."""
 
 

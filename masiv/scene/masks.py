@@ -15,17 +15,21 @@ def from_white(cutout: np.ndarray, image: np.ndarray) -> np.ndarray:
     A pixel that is white in ``image`` too can be part of the object. Such pixels are, if they form a closed hole
     smaller than 1 % of the object.
     """
-    mask = ~(cutout == 255).all(axis=-1)
-    doubtful = ~mask & (image == 255).all(axis=-1)
+    mask = ~_is_white(cutout)
     count, labels, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
     area = max(int(mask.sum()), 1)
     for label in range(1, count):
         x, y, width, height, size = stats[label]
         touches_border = x == 0 or y == 0 or x + width == mask.shape[1] or y + height == mask.shape[0]
-        hole = labels == label
-        if not touches_border and size <= 0.01 * area and doubtful[hole].all():
-            mask |= hole
+        if not touches_border and size <= 0.01 * area and _is_white(image)[labels == label].all():
+            mask |= labels == label
     return mask.astype(np.float32)
+
+
+def _is_white(image: np.ndarray) -> np.ndarray:
+    """Which pixels (H, W) are pure white."""
+    white = (255, 255, 255)
+    return cv2.inRange(np.ascontiguousarray(image), white, white) > 0
 
 
 def from_plain_background(image: np.ndarray) -> np.ndarray:

@@ -241,7 +241,7 @@ class Pictures:
             for view, known in frames.items()
         }
         images = {
-            view: np.stack([self._read(view, self.paths[view, frame])[..., :3] for frame in known])
+            view: [self._read(view, self.paths[view, frame])[..., :3] for frame in known]
             for view, known in chosen.items()
         }
         return learn_background(images, {view: self._read(view, self.backgrounds[view])[..., :3] for view in frames})
@@ -273,7 +273,7 @@ def read_pixels(path: Path) -> np.ndarray:
         raise InputError(f"{path} has {raw.dtype} pixels: give pictures with 8 or 16 bits a channel")
     if raw.ndim == 2:
         return np.repeat(raw[..., None], 3, axis=-1)
-    return np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[-1]]])
+    return cv2.cvtColor(raw, cv2.COLOR_BGR2RGB if raw.shape[-1] == 3 else cv2.COLOR_BGRA2RGBA)
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from masiv.scene.frame_cache import Frame
 from masiv.scene.scene import Scene
+
+FULL = 0.6
+"""Part of a picture from which on a mask covers suspiciously much."""
 
 
 def conventions(scene: Scene) -> dict[str, Any]:
@@ -42,31 +47,32 @@ def _shutters(scene: Scene) -> dict[str, Any]:
     }
 
 
-def summarise(scene: Scene) -> dict[str, Any]:
-    """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem.
+def _ignore(view: int, frame: int, picture: Frame) -> None:
+    pass
+
+
+def summarise(scene: Scene, look: Callable[[int, int, Frame], None] = _ignore) -> dict[str, Any]:
+    """The content of ``masiv inspect``. Reads every picture; one without the object becomes a problem. look(view,
+    frame, picture) is called with each, frame after frame: masks that agree over the views are made for one frame at a
+    time, and a large recording does not stay in memory.
 
     What compares the cameras is not known here: ``consistency_px``, ``mask_agreement``, ``mask_doubt``, the
     time offsets and the frames that flicker.
     """
     if scene.load_cloud is not None:
         return _summarise_clouds(scene)
-    problems = list(scene.problems)
     coverage = np.zeros((len(scene.views), scene.frame_count))
     seen = np.zeros(coverage.shape, bool)
     known: list[float] = []
-    for row, view in enumerate(scene.views):
-        for frame in range(scene.frame_count):
+    for frame in range(scene.frame_count):
+        for row, view in enumerate(scene.views):
             picture = scene.frame(view, frame)
             seen[row, frame] = picture.valid.any()
             coverage[row, frame] = picture.mask.mean()
             if picture.depth is not None and coverage[row, frame] > 0:
                 known.append(float((picture.depth[picture.mask > 0.5] > 0).mean()))
-            if seen[row, frame] and coverage[row, frame] == 0:
-                problems.append(f"view {view} at frame {frame}: the mask is empty")
-            elif coverage[row, frame] > 0.6:
-                problems.append(
-                    f"view {view} at frame {frame}: the mask covers {coverage[row, frame]:.0%} of the picture"
-                )
+            look(view, frame, picture)
+    problems = [*scene.problems, *_coverage_problems(scene, coverage, seen)]
     pictures = dict(zip(scene.views, seen.sum(axis=1).tolist(), strict=True))
     coverage = coverage[seen] if seen.any() else coverage
     return {
@@ -96,6 +102,19 @@ def summarise(scene: Scene) -> dict[str, Any]:
         ],
         "problems": problems,
     }
+
+
+def _coverage_problems(scene: Scene, coverage: np.ndarray, seen: np.ndarray) -> list[str]:
+    """A sentence for each mask that is empty or nearly full. coverage (V, F), seen (V, F) bool."""
+    problems = []
+    for row, view in enumerate(scene.views):
+        for frame in range(scene.frame_count):
+            share = coverage[row, frame]
+            if seen[row, frame] and share == 0:
+                problems.append(f"view {view} at frame {frame}: the mask is empty")
+            elif share > FULL:
+                problems.append(f"view {view} at frame {frame}: the mask covers {share:.0%} of the picture")
+    return problems
 
 
 def _summarise_clouds(scene: Scene) -> dict[str, Any]:

@@ -25,23 +25,29 @@ def simulate_release(
     if frames < 2:
         raise InputError(f"--frames {frames}: give at least 2")
     times = np.arange(frames) / fps
+    if release.motion is not None and times[-1] > release.motion.times[-1] + 1 / fps:
+        known = int(release.motion.times[-1] * fps) + 1
+        raise InputError(
+            f"--frames {frames}: the motion of the clamp is known for {known} frames: give as many at most"
+        )
     members = effect_members(twin, twin.body)
     effects = body.effects(members, body.context(float(times[-1]), 1 / fps))
     causes = [effect for effect, _ in members if accelerates(effect)]
     substep = body.substep(twin.law, times, effects)
     simulator = body.simulator(substep, body.contact, torch.float32)
     ends = [round(float(t) / substep) for t in times]
-    state, at, positions, felt = body.released(), 0, [], []
+    state, at, positions, felt = body.at_start(simulator, twin.law, effects, torch.float32), 0, [], []
+    acting = next((now for _, _, now in body.pieces(effects, 0, 1, substep)), effects)
     for frame, end in enumerate(ends):
-        if end > at:
+        for begin, stop, acting in body.pieces(effects, at, end, substep):
             try:
-                state = simulator.run(state, twin.law, end - at, [], effects, at * substep).final
+                state = simulator.run(state, twin.law, stop - begin, [], acting, begin * substep).final
             except NonFiniteError as error:
-                raise NonFiniteError(at + error.substep, error.particle, error.detail) from error
+                raise NonFiniteError(begin + error.substep, error.particle, error.detail) from error
         at = end
         positions.append(state.position)
         if fields:
-            felt.append(fields_at(simulator, twin.law, state, effects, causes, at * substep, body.axes))
+            felt.append(fields_at(simulator, twin.law, state, acting, causes, at * substep, body.axes))
         if frame:
             progress("simulate", frame, frames - 1)
     moved = torch.stack(positions)
@@ -75,4 +81,5 @@ def released_body(twin: Twin) -> MarkedBody:
         ground=twin.ground,
         contact=twin.contact,
         speed=start.release.max_speed,
+        motion=start.release.motion,
     )

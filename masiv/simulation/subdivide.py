@@ -37,7 +37,10 @@ def merge_subparticles(positions: np.ndarray, count: int) -> np.ndarray:
 
 
 def subdivide_twin(twin: Twin) -> Twin:
-    """``twin`` with each particle of its only body in ``simulator.subparticles`` parts, on the grid that it had."""
+    """``twin`` with each particle of its only body in ``simulator.subparticles`` parts, on the grid that it had. A body
+    of springs stays as it is: its springs are between its particles."""
+    if twin.law.kind == "springs":
+        return replace(twin, simulator=twin.simulator.model_copy(update={"subparticles": 1}))
     config, count = twin.simulator, len(twin.positions)
     spacing = (twin.volume / count) ** (1 / 3)
     simulator = config.model_copy(

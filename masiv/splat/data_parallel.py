@@ -24,11 +24,12 @@ import torch
 
 from masiv import runtime
 from masiv.errors import MasivError
+from masiv.runtime import ONE_THREAD
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.image_formation import ImageFormation
 from masiv.splat.losses import Pairs
 from masiv.splat.objective import PARAMETER_NAMES, Objective, Part
-from masiv.workers import ONE_THREAD, run_task, unwrap
+from masiv.workers import run_task, unwrap
 
 Gradients = Sequence[torch.Tensor | None]
 EXIT_TIMEOUT_S = 10.0

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from masiv import runtime
 from masiv.errors import InputError, MasivError
 from masiv.scene.camera import Camera
 
@@ -189,4 +190,6 @@ def _kernels(dtype: torch.dtype) -> Any:
 
     from masiv.kernels.rasterise import kernels
 
+    if dtype == torch.float64:
+        runtime.check_float64("render: dtype torch.float64")
     return kernels({torch.float32: ti.f32, torch.float64: ti.f64}[dtype])

@@ -41,7 +41,7 @@ def simulate(spec: SynthSpec, body: Solid) -> np.ndarray:
     position = torch.as_tensor(body.particles, dtype=torch.float32)
     effects = _effects(spec, position, body.volume)
     demand = effects.substep_demand()
-    speed = math.sqrt(demand.modulus_factor * law.wave_modulus() / spec.material.density)
+    speed = math.sqrt((demand.modulus_factor * law.wave_modulus() + demand.modulus) / spec.material.density)
     fall = math.sqrt(np.square(spec.velocity).sum() + 2 * np.linalg.norm(spec.gravity) * spec.shape.clearance)
     diffusion = viscous_substep(
         spacing=spacing, density=spec.material.density, viscosity=demand.viscosity, courant_number=_COURANT

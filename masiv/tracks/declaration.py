@@ -39,17 +39,22 @@ class HalfSpaceDeclaration(_Part):
 class ClampDeclaration(_Part):
     """The clamped region: ``half_space`` or ``box`` (two opposite corners), in the axes and units of the geometry.
 
-    ``markers``: those fixed to the clamp, which do not move with the material.
+    ``markers``: those fixed to the clamp, which do not move with the material. ``prescribed_motion``: the clamp is
+    carried, and moves as its markers do: one or two show its displacement, three that are not on a line its rotation,
+    too. The body is at rest in it before the release.
     """
 
     half_space: HalfSpaceDeclaration | None = None
     box: tuple[Vector, Vector] | None = None
     markers: tuple[str, ...] = ()
+    prescribed_motion: bool = False
 
     @model_validator(mode="after")
     def _one_region(self) -> ClampDeclaration:
         if (self.half_space is None) == (self.box is None):
             raise ValueError("give one of half_space and box")
+        if self.prescribed_motion and not self.markers:
+            raise ValueError("prescribed_motion needs markers on the clamp: name them in markers")
         return self
 
 
@@ -136,7 +141,9 @@ class RunDeclaration(_Part):
     ``rest_frames`` [first, last): frames in which the body is held at rest. ``release_time`` [s, as in the file]: by
     default it is estimated. ``ignore_after_release`` [s]: the run is not compared with the model for this
     long, because the model does not contain what releases the body (a hand that follows, a slack thread). Then the
-    initial height and an effective initial state are fitted too. Its earlier name is ``unsteady``.
+    initial height and an effective initial state are fitted too. Its earlier name is ``unsteady``. ``held_straight``:
+    false if a clamped body is not held in its rest shape before the release; then the deflection of its free end is
+    fitted too.
     """
 
     file: Path
@@ -149,6 +156,7 @@ class RunDeclaration(_Part):
     rest_frames: tuple[Frame, Frame] | None = None
     release_time: FiniteFloat | None = None
     ignore_after_release: Annotated[FiniteFloat, Field(ge=0)] = 0.0
+    held_straight: bool = True
     time: tuple[FiniteFloat, FiniteFloat] | None = None
 
     @model_validator(mode="before")

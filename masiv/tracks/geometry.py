@@ -31,6 +31,13 @@ class Geometry:
         """Longest side of the bounding box [m]."""
         return float((self.upper - self.lower).max())
 
+    @property
+    def centroid(self) -> np.ndarray:
+        """Centre (3,) [m] of the volume, by the tetrahedra between the origin and the faces."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
+        return ((a + b + c) * volumes[:, None]).sum(0) / (4 * volumes.sum())
+
     def lattice_inside(self, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cells of a lattice that divides the bounding box in ``counts`` (3,) parts.
 

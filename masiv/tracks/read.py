@@ -93,7 +93,7 @@ def _clamp(name: str, body: BodyDeclaration, geometry: Geometry) -> Clamp | None
         if (high - low).min() <= 0:
             raise InputError(f"scene.yaml: bodies.{name}.clamp.box is flat: give two opposite corners")
         normals, heights = np.concatenate([np.eye(3), -np.eye(3)]), np.concatenate([high, -low])
-    clamp = Clamp(normals, heights, declared.markers)
+    clamp = Clamp(normals, heights, declared.markers, declared.prescribed_motion)
     touched, slack = geometry.vertices, 1e-6 * geometry.size
     if not Clamp(normals, heights + slack, ()).holds(touched).any():
         raise InputError(
@@ -148,13 +148,20 @@ def _run(
         if np.isnan(at_rest[m][np.isfinite(positions[:, m]).any(axis=0)]).any():
             problems.append(f"{where}: marker {marker} is not seen at rest, so it is not tied to the body")
     release = run.release_time
+    carried = clamped is not None and clamped.prescribed
+    if carried and run.ignore_after_release:
+        raise InputError(f"scene.yaml: {where}: ignore_after_release is for a clamp that does not move: leave it out")
+    if carried and release is None:  # the clamp moves first, and then the body
+        if rest is None:
+            raise InputError(f"scene.yaml: {where}: its clamp moves: give rest_frames, or release_time before it does")
+        release = float(times[rest.stop - 1])
     if rest is not None and noise is not None and release is None:
         free = [m for m, marker in enumerate(markers) if not (clamped and marker in clamped.markers)]
         release = estimate_release(times, positions[:, free], rest, at_rest[free], noise[free])
         if release is None:
             problems.append(f"{where}: it never leaves its rest position by more than the noise: no release found")
     made = Run(name, body, run.condition, run.use, markers, times, positions, rate, rest, at_rest, noise, release, None,
-               run.ignore_after_release)  # fmt: skip
+               run.ignore_after_release, run.held_straight)  # fmt: skip
     made = replace(made, placement=_placement(where, made, declared.bodies[body], problems))
     return made if run.time is None else made.between(*run.time)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from masiv.files import atomic
+from masiv.tracks.rest import find_rest
 from masiv.tracks.tracks import Run, Tracks
 
 _PATHS = 3000
@@ -60,6 +61,7 @@ def gaps(run: Run) -> dict[str, Any]:
 
 def _run(run: Run) -> dict[str, Any]:
     noise = run.noise_std
+    found = find_rest(run.times, run.positions) if run.rest is None and run.release is None else None
     measured = "".join(axis for axis, known in zip("xyz", np.asarray(run.axes.any(axis=0)), strict=True) if known)
     return {
         "name": run.name,
@@ -73,6 +75,8 @@ def _run(run: Run) -> dict[str, Any]:
         "start_s": float(run.times[0]),
         "duration_s": float(run.times[-1] - run.times[0]),
         "release_s": run.release,
+        "proposed_rest_frames": None if found is None else [found[0].start, found[0].stop],
+        "proposed_release_s": None if found is None else found[1],
         "travel_mm": 1e3 * _travel(run),
         "noise_mm": None if noise is None else 1e3 * float(np.sqrt(np.nanmean(noise**2))),
         "placement_error_mm": None if run.placement is None else 1e3 * run.placement.error,
@@ -129,6 +133,11 @@ def tracks_as_text(summary: dict[str, Any]) -> str:
             f"travel {distance(run['travel_mm'])}"
             + ("" if run["noise_mm"] is None else f"; noise {run['noise_mm']:.2g} mm")
             + ("" if run["release_s"] is None else f"; released at {run['release_s']:.4g} s")
+            + (
+                ""
+                if run["proposed_rest_frames"] is None
+                else f"; rests until {run['proposed_release_s']:.4g} s: rest_frames: {run['proposed_rest_frames']}"
+            )
             + ("" if not run["placement_error_mm"] else f"; placed within {run['placement_error_mm']:.2g} mm")
             + (f"; {run['condition']}" if run["condition"] else "")
         )

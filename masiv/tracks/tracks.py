@@ -20,11 +20,12 @@ MIN_SEEN_SHARE, MIN_SEEN_FRAMES = 0.5, 6
 @dataclass(frozen=True)
 class Clamp:
     """What is held: {x : normals x ≤ heights}, in the body's own axes: normals (P, 3) unit, heights (P,) [m].
-    ``markers``: those fixed to the clamp."""
+    ``markers``: those fixed to the clamp. prescribed: it moves with them (``masiv.tracks.prescribed_motion``)."""
 
     normals: np.ndarray
     heights: np.ndarray
     markers: tuple[str, ...]
+    prescribed: bool = False
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Which points (..., 3) [m, own axes] are inside, bool (...)."""
@@ -59,7 +60,7 @@ class Run:
     frame that shows them, without rest frames), NaN for what was not measured; noise_std (M, 3): standard deviation of
     each axis at rest (None: without two rest frames); release [s]: when the body is let go (None: not known);
     placement: the body's own axes -> world at rest (None: no geometry); ignore_after_release [s]: not
-    compared for this long.
+    compared for this long; held_straight: the body has its rest shape before the release.
     """
 
     name: str
@@ -76,6 +77,7 @@ class Run:
     release: float | None
     placement: Placement | None
     ignore_after_release: float = 0.0
+    held_straight: bool = True
 
     @property
     def axes(self) -> np.ndarray:

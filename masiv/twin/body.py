@@ -11,6 +11,7 @@ import numpy as np
 from masiv.errors import InputError
 from masiv.scene.scene import Ground
 from masiv.tracks.placement import Placement
+from masiv.tracks.prescribed_motion import PrescribedMotion
 from masiv.tracks.tracks import Clamp
 
 if TYPE_CHECKING:
@@ -74,12 +75,14 @@ class Release:
     """The start of a body that is held at rest and then let go.
 
     markers: rest position (3,) [m] of each marker that moves with the material. max_speed [m/s]: the greatest that was
-    observed, from which the substep follows. offsets: what was fitted of the start, see ``OFFSET_UNITS``.
+    observed, from which the substep follows. offsets: what was fitted of the start, see ``OFFSET_UNITS``. motion: that
+    of the clamp, if it is carried.
     """
 
     markers: dict[str, np.ndarray]
     max_speed: float
     offsets: dict[str, float] = field(default_factory=dict)
+    motion: PrescribedMotion | None = None
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
@@ -17,6 +17,7 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
 from masiv.strict import read_yaml, reason, validated
 from masiv.tracks.placement import Placement
+from masiv.tracks.prescribed_motion import PrescribedMotion
 from masiv.tracks.tracks import Clamp
 from masiv.twin.body import OFFSET_UNITS, Body, Boundary, InitialCondition, Release, TwinEffect
 from masiv.twin.plausible import check_plausible
@@ -89,6 +90,7 @@ class ClampPart(Part):
     normals: list[Vector]
     heights: list[float]
     markers: list[str]
+    prescribed: bool = False
 
 
 class DragPart(Part):
@@ -136,10 +138,19 @@ class OffsetsPart(Part):
     tip_deflection: Scalar[Literal["m"]] | None = None
 
 
+class MotionPart(Part):
+    """A ``PrescribedMotion``; its times, displacement and rotation are tensors of ``file``, after ``tensor``."""
+
+    file: FileName
+    tensor: str
+    centre: Vector3[Literal["m"]]
+
+
 class ReleasePart(Part):
     markers: dict[str, Vector3[Literal["m"]]]
     max_speed: Scalar[Literal["m/s"]]
     offsets: OffsetsPart
+    motion: MotionPart | None = None
 
 
 class InitialConditionPart(Part):
@@ -184,6 +195,10 @@ def write_document(twin: Mapping[str, Any], folder: Path, name: str = TWIN_FILE)
         bodies.append(_body_entry(body, law_file, particles_file))
     if tensors:
         write_safetensors(folder / particles_file, tensors)
+    motion_file = f"motion{suffix}.safetensors"
+    motions = _motion_tensors(twin["initial_conditions"])
+    if motions:
+        write_safetensors(folder / motion_file, motions)
     boundary: Boundary = twin["boundary"]
     ground = None
     if boundary.ground is not None:
@@ -191,7 +206,7 @@ def write_document(twin: Mapping[str, Any], folder: Path, name: str = TWIN_FILE)
     document = {
         "schema": SCHEMA,
         "bodies": bodies,
-        "initial_conditions": [_initial_condition_entry(start) for start in twin["initial_conditions"]],
+        "initial_conditions": [_initial_condition_entry(start, motion_file) for start in twin["initial_conditions"]],
         "gravity": _quantity(twin["gravity"], "m/s^2"),
         "boundary": {"ground": ground, "contact": boundary.contact, "friction": float(boundary.friction)},
         "up": _floats(twin["up"]),
@@ -212,6 +227,7 @@ def _body_entry(body: Body, law_file: str, particles_file: str) -> dict[str, Any
             "normals": [_floats(normal) for normal in body.clamp.normals],
             "heights": _floats(body.clamp.heights),
             "markers": list(body.clamp.markers),
+            **({"prescribed": True} if body.clamp.prescribed else {}),
         }
     if body.drag is not None:
         drag = {
@@ -232,7 +248,18 @@ def _body_entry(body: Body, law_file: str, particles_file: str) -> dict[str, Any
     }
 
 
-def _initial_condition_entry(start: InitialCondition) -> dict[str, Any]:
+MOTION_TENSORS = ("times", "displacement", "rotation")
+"""Of a ``PrescribedMotion``, in the order of its fields but for the centre."""
+
+
+def _motion_tensors(starts: Sequence[InitialCondition]) -> dict[str, np.ndarray]:
+    return {
+        f"{start.observation}.{name}": np.ascontiguousarray(getattr(start.release.motion, name), np.float64)
+        for start in starts if start.release is not None and start.release.motion is not None for name in MOTION_TENSORS
+    }  # fmt: skip
+
+
+def _initial_condition_entry(start: InitialCondition, motion_file: str) -> dict[str, Any]:
     placement, release = None, None
     if start.placement is not None:
         placement = {
@@ -246,6 +273,9 @@ def _initial_condition_entry(start: InitialCondition) -> dict[str, Any]:
             "max_speed": _quantity(start.release.max_speed, "m/s"),
             "offsets": {name: _quantity(value, OFFSET_UNITS[name]) for name, value in start.release.offsets.items()},
         }
+        if start.release.motion is not None:
+            centre = _quantity(start.release.motion.centre, "m")
+            release["motion"] = {"file": motion_file, "tensor": start.observation, "centre": centre}
     return {
         "observation": start.observation,
         "body": start.body,
@@ -305,7 +335,7 @@ def _fields(path: Path, scene: Callable[[], Mapping[str, Any]] | None) -> dict[s
         raise InputError(f"{path} has schema {data.get('schema')}, this masiv reads 1 and {SCHEMA}: identify again")
     document = validated(Document, data, str(path))
     bodies = tuple(_body(part, f"{path}: 'bodies.{k}", path.parent) for k, part in enumerate(document.bodies))
-    starts = tuple(_initial_condition(part) for part in document.initial_conditions)
+    starts = tuple(_initial_condition(part, path.parent) for part in document.initial_conditions)
     effects = tuple(read_effect(part, f"{path}: 'effects.{k}") for k, part in enumerate(document.effects))
     check_names(path, bodies, starts, effects)
     ground = document.boundary.ground
@@ -342,7 +372,7 @@ def _body(part: BodyPart, where: str, folder: Path) -> Body:
         if len(part.clamp.normals) != len(part.clamp.heights):
             raise InputError(f"{where}.clamp' needs one height for each normal")
         normals = np.array(part.clamp.normals).reshape(-1, 3)
-        clamp = Clamp(normals, np.array(part.clamp.heights), tuple(part.clamp.markers))
+        clamp = Clamp(normals, np.array(part.clamp.heights), tuple(part.clamp.markers), part.clamp.prescribed)
     drag = None
     if part.drag is not None:
         d = part.drag
@@ -378,7 +408,23 @@ def read_particles(path: Path, tensor: str) -> np.ndarray:
     return particles
 
 
-def _initial_condition(part: InitialConditionPart) -> InitialCondition:
+def _motion(part: MotionPart, folder: Path) -> PrescribedMotion:
+    """Raises InputError if its file does not hold a motion."""
+    path = folder / part.file
+    try:
+        tensors = read_safetensors(path)[0]
+        times, displacement, rotation = (tensors[f"{part.tensor}.{name}"] for name in MOTION_TENSORS)
+    except (InputError, KeyError) as error:
+        raise InputError(
+            f"{path} does not hold the motion of the clamp in {part.tensor} ({reason(error, path)}): identify again"
+        ) from error
+    count = len(times)
+    if count < 2 or displacement.shape != (count, 3) or rotation.shape != (count, 3) or (np.diff(times) <= 0).any():
+        raise InputError(f"{path}: the motion of the clamp in {part.tensor} is not one of ascending times (K,)")
+    return PrescribedMotion(times, np.array(part.centre.value), displacement, rotation)
+
+
+def _initial_condition(part: InitialConditionPart, folder: Path) -> InitialCondition:
     placement, release = None, None
     if part.placement is not None:
         p = part.placement
@@ -386,7 +432,8 @@ def _initial_condition(part: InitialConditionPart) -> InitialCondition:
     if part.release is not None:
         offsets = {name: offset.value for name, offset in part.release.offsets if offset is not None}
         markers = {name: np.array(place.value) for name, place in part.release.markers.items()}
-        release = Release(markers, part.release.max_speed.value, offsets)
+        motion = None if part.release.motion is None else _motion(part.release.motion, folder)
+        release = Release(markers, part.release.max_speed.value, offsets, motion)
     return InitialCondition(
         part.observation, part.body, part.fps, np.array(part.velocity.value), np.array(part.omega.value),
         part.condition, placement, release,

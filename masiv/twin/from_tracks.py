@@ -10,6 +10,7 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.geometry import fill_geometry, mean_diameter
 from masiv.tracks.placement import Placement
+from masiv.tracks.prescribed_motion import prescribed_motion
 from masiv.tracks.tracks import Run, TrackedBody, Tracks
 from masiv.twin.body import Body, Boundary, InitialCondition, Release
 from masiv.twin.twin import Twin
@@ -72,6 +73,8 @@ def _release(tracks: Tracks, run: Run, config: TracksConfig) -> InitialCondition
     free = tracks.bodies[run.body].free_markers(run)
     _, _, speed = run.released(free, run.ignore_after_release, config.duration)
     markers = {run.markers[m]: run.at_rest[m] for m in free}
+    clamp = tracks.bodies[run.body].clamp
+    release = Release(markers, speed, motion=None if clamp is None else prescribed_motion(run, clamp))
     return InitialCondition(
-        run.name, run.body, run.rate, np.zeros(3), np.zeros(3), run.condition, run.placement, Release(markers, speed)
+        run.name, run.body, run.rate, np.zeros(3), np.zeros(3), run.condition, run.placement, release
     )  # fmt: skip

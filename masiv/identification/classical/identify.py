@@ -12,7 +12,7 @@ from masiv.identification.classical.shortlist import FamilyFits, fit_shortlist
 from masiv.identification.losses.objective import Objective
 from masiv.identification.recording import FitRecording
 from masiv.progress import Progress
-from masiv.workers import Workers, process_count
+from masiv.workers import workers_for
 
 CHOSEN_BY_IMAGES = "least image loss; the law with fewer parameters if two are about equal"
 CHOSEN_BY_BIC = "least Bayesian information criterion"
@@ -29,7 +29,7 @@ def fit_classical_law(
     objective = recording.objective
     with_images = objective.has_surface_finetune
     if kind == "auto":
-        with Workers(process_count(objective.config.processes), "identify.processes") as workers:
+        with workers_for(objective.config.processes, objective.config.scheduler, "identify.processes") as workers:
             found = fit_shortlist(
                 coarse, recording.initial_state, recording.first_frames, with_images, checkpoint, progress, workers
             )

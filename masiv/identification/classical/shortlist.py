@@ -10,7 +10,7 @@ from masiv.errors import MasivError
 from masiv.identification.classical.fit import FamilyFit, fit_family, fit_further, save_fit
 from masiv.identification.classical.model_selection import image_losses, rank_by_bic, rank_by_image_loss
 from masiv.identification.losses.objective import Objective
-from masiv.models.families import FAMILIES
+from masiv.models.families import CONTINUUM_FAMILIES
 from masiv.models.initial_state import InitialState
 from masiv.progress import Progress, silent
 from masiv.workers import TaskError, Workers
@@ -64,9 +64,9 @@ def fit_shortlist(
     little of a fit that is far from its end. Raises MasivError if no family explains the motion.
     """
     saved = checkpoint.load() or {}
-    found = FamilyFits({kind: FamilyFit(**saved[kind]) for kind in FAMILIES if kind in saved})
+    found = FamilyFits({kind: FamilyFit(**saved[kind]) for kind in CONTINUUM_FAMILIES if kind in saved})
     task_progress = progress if workers.processes == 1 else silent
-    missing = [kind for kind in FAMILIES if kind not in found.fits]
+    missing = [kind for kind in CONTINUUM_FAMILIES if kind not in found.fits]
     tasks = [(kind, coarse, initial_state, first_frames, with_images, task_progress) for kind in missing]
     found.collect(missing, _short_fit, tasks, "identify: classical laws, in short", checkpoint, progress, workers)
     if not found.fits:

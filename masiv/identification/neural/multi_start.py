@@ -15,7 +15,7 @@ from masiv.identification.recording import FitRecording
 from masiv.identification.result import IdentificationResult
 from masiv.materials.neural import NeuralLaw
 from masiv.progress import Progress, silent
-from masiv.workers import TaskError, Workers, process_count, run_task, unwrap
+from masiv.workers import TaskError, Workers, run_task, unwrap, workers_for
 
 START_MARGIN = 1.3
 """The second starting law is fitted, too, if its objective is at most this factor of the first one's. Starting laws are
@@ -46,7 +46,7 @@ def fit_neural_law(
     """
     config = recordings[0].objective.config
     saved = checkpoint.load() or {}
-    with Workers(process_count(config.processes), "identify.processes") as workers:
+    with workers_for(config.processes, config.scheduler, "identify.processes") as workers:
         if "starts" in saved:
             starts = [StartingLaw.from_state(state) for state in saved["starts"]]
         else:

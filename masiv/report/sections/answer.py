@@ -19,6 +19,7 @@ LAWS = {
     "newtonian": "a viscous fluid (Newtonian)",
     "non_newtonian": "a fluid with a yield stress",
     "drucker_prager": "a granular material (Drucker–Prager)",
+    "springs": "springs with dampers between neighbouring particles",
 }
 PARAMETERS = {"youngs_modulus": "Young's modulus", "poissons_ratio": "Poisson's ratio"}
 VERDICTS = {

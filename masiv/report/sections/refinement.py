@@ -274,7 +274,7 @@ def _accepted(page: Page, accepted: Sequence[Mapping[str, Any]]) -> None:
     page.note("Axes of effects: y up (along the ground's normal), the ground at y = 0. A dash: not known.")
     for a in accepted:
         if a.get("carried_weight") is not None:
-            page.note(f"{_name(a)}: {question(a['carried_weight'])}")
+            page.note(f"{_name(a)}: {question(a['carried_weight'], a.get('carried_weight_stderr'))}")
     rows = [
         [_name(a), words(n), q["value"], q["stderr"], _unit(q["unit"])]
         for a in accepted
