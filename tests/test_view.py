@@ -286,8 +286,10 @@ def test_the_page_shows_the_motion_and_simulates_it_again(taichi, run, twin, bro
         seen.page.get_by_text("frame 1: 0.042 s").wait_for(timeout=1000 * WAIT_S)
         assert seen.errors == [], "after a frame"
         # What diverges is said, and the motion before it stays.
-        box.fill("-20")
+        # The simulation of the widgets must be over before the next request, for the last one wins.
+        before = page.shown
         page.controls.vectors["velocity"][0][0].value = 3.0
+        until(lambda: page.shown is not before, "the simulation with another velocity")
         page.controls.layers["gaussians"].value = True
         page.simulations.ask(Variation(velocity=(9e3, 0.0, 0.0)))
         seen.page.get_by_text("This cannot be simulated:").wait_for(timeout=1000 * WAIT_S)
