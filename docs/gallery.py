@@ -54,6 +54,7 @@ SHOWN = {
     "ground_friction": Show({"slipperiness": 20.0}, **SLIDE),
     "ground_height": Show({"height": 0.2}, **DROP),
     "hidden_obstacle": Show({"radius": 0.13, "x": 0.1, "y": 0.2, "z": 0.0}, **DROP),
+    "hung_mass": Show({"mass": 40.0, "x": -0.64, "y": 0.7, "z": 0.0, "length": 0.3}),
     "internal_pressure": Show({"pressure": 1.5e4}, **DROP),
     "linear_drag": Show({"rate": 3.0}),
     "magnus": Show({"lift_rate_x": 0.0, "lift_rate_y": -2.5, "lift_rate_z": 0.0}, omega=(0.0, -8.0, 0.0)),

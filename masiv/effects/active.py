@@ -20,6 +20,8 @@ from masiv.effects.effect import (
     MassEffect,
     NodalEffect,
     StressEffect,
+    SuspendedMass,
+    SuspendedMassEffect,
 )
 from masiv.effects.stability import SubstepDemand
 from masiv.errors import InputError
@@ -31,8 +33,8 @@ E = TypeVar("E", bound=Effect)
 class ActiveEffects:
     """Effects with the values (P,) of their parameters.
 
-    Raises InputError if two of them replace the contact or keep internal variables, or if values do not have the shape
-    of the parameters.
+    Raises InputError if two of them replace the contact, keep internal variables or hang from the body, or if values do
+    not have the shape of the parameters.
     """
 
     members: tuple[tuple[Effect, torch.Tensor], ...]
@@ -45,6 +47,9 @@ class ActiveEffects:
         remembered = [effect.name for effect, _ in self.of_kind(HistoryEffect)]
         if len(remembered) > 1:
             raise InputError(f"{' and '.join(remembered)} both keep internal variables: use one of them")
+        hung = [effect.name for effect, _ in self.of_kind(SuspendedMassEffect)]
+        if len(hung) > 1:
+            raise InputError(f"{' and '.join(hung)} both hang from the body: use one of them")
         for effect, theta in self.members:
             if theta.shape != (len(effect.parameters),):
                 raise InputError(
@@ -85,6 +90,12 @@ class ActiveEffects:
         """Sum (N, 3) [N] of the forces on the particles; None if no effect has one."""
         forces = [effect.force(theta, self.context) for effect, theta in self.of_kind(ForceEffect)]
         return functools.reduce(torch.add, forces) if forces else None
+
+    @torch.no_grad()
+    def suspended_mass(self) -> SuspendedMass | None:
+        """The mass that hangs from the body; None if there is none."""
+        masses = [effect.suspended_mass(theta, self.context) for effect, theta in self.of_kind(SuspendedMassEffect)]
+        return masses[0] if masses else None
 
     def ground_shift(self) -> torch.Tensor:
         """Height () [m] by which the ground is raised."""

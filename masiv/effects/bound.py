@@ -11,6 +11,7 @@ from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import searched_causes
 from masiv.effects.context import EffectContext
 from masiv.effects.effect import ContactEffect, Effect, HistoryEffect, NodalEffect, StressEffect
+from masiv.errors import MasivError
 
 if TYPE_CHECKING:
     from masiv.kernels.mpm import MpmKernels
@@ -37,11 +38,12 @@ class BoundEffects:
         self.coefficients = effects.coefficients() if effects else []
         self.force = effects.force() if effects else None
         self.mass_factor = effects.mass_factor() if effects else None
+        self.suspended = effects.suspended_mass() if effects else None
         self._values = [c.detach().to(mpm.torch_dtype).contiguous() for c in self.coefficients]
         self._force_values = None if self.force is None else self.force.detach().to(mpm.torch_dtype).contiguous()
         self.on_grid = any(not isinstance(e, StressEffect) for e in self.members)
         self.on_stress = any(isinstance(e, StressEffect) for e in self.members)
-        self.empty = not self.members and self.force is None
+        self.empty = not self.members and self.force is None and self.suspended is None
         self._internal = None
         for effect, values in zip(self.members, self._values, strict=True):
             if isinstance(effect, HistoryEffect):
@@ -53,13 +55,17 @@ class BoundEffects:
             self.forward: Any = no_effects(mpm)
         else:
             self._known = _compiled_together(self.members)
-            self.forward = _forward_effects(mpm, self._known, effects.context)
+            self.forward = _forward_effects(mpm, self._known, effects.context, suspends=self.suspended is not None)
 
     def write(self) -> None:
         """Fill the fields of the forward substep, which rollouts of one capacity share."""
         if not self.empty:
             values = zip(self.members, self._values, strict=True)
             self.forward.write({self._known.index(e): c for e, c in values}, self._force_values)
+        if self.suspended is not None:
+            kernels = self.forward.suspension
+            kernels.load[None], kernels.length[None] = self.suspended.mass, self.suspended.length
+            kernels.write_weights(self.suspended.weights.detach().to(self.mpm.torch_dtype).contiguous())
 
     def write_internal(self, values: torch.Tensor | None, first: bool) -> None:
         """Internal variables (N, K) before local substep 0, None if none are known. first: of the rollout, too."""
@@ -78,6 +84,22 @@ class BoundEffects:
         out = torch.empty(self.count, internal.branches * internal.size, dtype=self.mpm.torch_dtype)
         self._internal.read(s, out)
         return out
+
+    def write_suspended(self, state: torch.Tensor | None) -> None:
+        """Place and velocity (2, 3) of the suspended mass before local substep 0; None: it hangs at rest."""
+        if self.suspended is not None and state is None:
+            self.forward.suspension.hang(self.count)
+        elif self.suspended is not None and state is not None:
+            kernels, (place, velocity) = self.forward.suspension, state.tolist()
+            kernels.place[0], kernels.velocity[0] = place, velocity
+
+    def read_suspended(self, s: int) -> torch.Tensor | None:
+        """Place and velocity (2, 3) [m, m/s] of the suspended mass before local substep s; None if there is none."""
+        if self.suspended is None:
+            return None
+        kernels = self.forward.suspension
+        rows = [list(kernels.place[s]), list(kernels.velocity[s])]
+        return torch.tensor(rows, dtype=self.mpm.torch_dtype)
 
     # ---- a substep in several launches -----------------------------------------------------------------------------
 
@@ -98,15 +120,20 @@ class BoundEffects:
             self.mpm.grid_update(offset, nodes)
 
     def apply_forces(self, s: int) -> None:
-        """Forces on the particles at the end of substep s."""
+        """Forces on the particles, and the suspended mass, at the end of substep s."""
         if self.force is not None:
             self.forward.on_velocities(s + 1, self.count)
+        if self.suspended is not None:
+            self.forward.suspension.step(s + 1, self.count)
 
     # ---- its adjoint, in the reverse order -------------------------------------------------------------------------
 
     @cached_property
     def adjoint(self) -> BoundAdjoints:
-        """Kernels of the adjoint, with fields of their own: made if one is asked for."""
+        """Kernels of the adjoint, with fields of their own: made if one is asked for. Raises MasivError for a suspended
+        mass."""
+        if self.suspended is not None:
+            raise MasivError("a rollout with a suspended mass has no gradient: fit by finite differences")
         return BoundAdjoints(self.mpm, self.count, self.members, self._values, self._force_values)
 
 
@@ -221,8 +248,9 @@ def _compiled_together(members: list[KernelEffect]) -> list[KernelEffect]:
     return library if all(e in library for e in members) else members
 
 
-def _forward_effects(mpm: MpmKernels, effects: list[KernelEffect], context: EffectContext) -> Any:
+def _forward_effects(mpm: MpmKernels, effects: list[KernelEffect], context: EffectContext, *, suspends: bool) -> Any:
     from masiv.kernels.forward_effects import ForwardEffects
+    from masiv.kernels.suspension import SuspensionKernels
 
     def make() -> Any:
         nodal = [(e.node_velocity(), _size(e, context)) for e in effects if isinstance(e, NodalEffect)]
@@ -233,9 +261,10 @@ def _forward_effects(mpm: MpmKernels, effects: list[KernelEffect], context: Effe
                 size = _size(e, context)
                 internal = _internal_variables(mpm, e, size) if isinstance(e, HistoryEffect) else None
                 stress.append((e.particle_stress(), size, internal))
-        return ForwardEffects(mpm, nodal, contact, stress)
+        suspension = mpm.attached(SuspensionKernels, lambda: SuspensionKernels(mpm)) if suspends else None
+        return ForwardEffects(mpm, nodal, contact, stress, suspension)
 
-    return mpm.attached((ForwardEffects, tuple(effects)), make)
+    return mpm.attached((ForwardEffects, tuple(effects), suspends), make)
 
 
 def _internal_variables(mpm: MpmKernels, effect: HistoryEffect, coefficients: int) -> Any:

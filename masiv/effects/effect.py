@@ -6,7 +6,8 @@ A kind determines where in the model an effect acts, and has one abstract method
 1. ``StressEffect``: Kirchhoff stress of the particles, after the law; ``HistoryEffect``, one with internal variables;
 2. ``NodalEffect``: velocity of the grid's nodes, after gravity;
 3. ``ContactEffect``: velocity of the nodes on or below the ground, in place of the model's contact;
-4. ``ForceEffect``: velocity of the particles, at the end of the substep.
+4. ``ForceEffect``: velocity of the particles, at the end of the substep;
+5. ``SuspendedMassEffect``: a mass with a motion of its own, and the particles that it is tied to.
 
 ``MassEffect`` changes the particles' masses, ``GeometryEffect`` the height of the ground and ``ClockEffect`` the times
 of the observation, once a rollout. An effect of two kinds derives from both.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -131,6 +133,25 @@ class ForceEffect(Effect):
         """Forces f (N, 3) [N]; differentiable."""
 
 
+@dataclass(frozen=True)
+class SuspendedMass:
+    """mass [kg] on an inextensible thread of length [m], tied to the particles with weights (N,) of sum 1."""
+
+    mass: float
+    length: float
+    weights: torch.Tensor
+
+
+class SuspendedMassEffect(Effect):
+    r"""$v_p \leftarrow v_p + w_p \lambda n / m_p$ at each particle $p$, $u \leftarrow u + \Delta t\, g - \lambda n / M$
+    with the impulse $\lambda$ of a thread along $n$: a mass $M$ with the velocity $u$ hangs from the body. At most one
+    may act. A rollout with it has no gradient."""
+
+    @abstractmethod
+    def suspended_mass(self, theta: torch.Tensor, context: EffectContext) -> SuspendedMass:
+        """The mass, its thread, and where it is tied."""
+
+
 class GeometryEffect(Effect):
     r"""The ground is at $y = h(\theta)$ in place of $y = 0$."""
 
@@ -147,4 +168,13 @@ class ClockEffect(Effect):
         """Delay () [s]; differentiable."""
 
 
-KINDS = (NodalEffect, ContactEffect, StressEffect, MassEffect, ForceEffect, GeometryEffect, ClockEffect)
+KINDS = (
+    NodalEffect,
+    ContactEffect,
+    StressEffect,
+    MassEffect,
+    ForceEffect,
+    SuspendedMassEffect,
+    GeometryEffect,
+    ClockEffect,
+)

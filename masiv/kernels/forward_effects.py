@@ -9,6 +9,8 @@ from masiv.kernels.grid import DT, DX, FRICTION, NO_GROUND, contact_velocity, mo
 class NoEffects:
     """The interface of ``ForwardEffects`` where nothing acts."""
 
+    suspends = False
+
     def __init__(self, mpm):
         self.mpm = mpm
 
@@ -28,6 +30,10 @@ class NoEffects:
     def on_velocity_of(self, s: ti.i32, p: ti.i32):
         pass
 
+    @ti.func
+    def on_suspended(self, s: ti.i32, count: ti.i32):
+        pass
+
 
 def no_effects(mpm):
     """The ``NoEffects`` of ``mpm``."""
@@ -38,13 +44,14 @@ def no_effects(mpm):
 class ForwardEffects:
     """Functions of effects (``masiv.effects.effect``), each with its number of coefficients: on the nodes, on the nodes
     on or below the ground (of which one at most acts), on the stress, the latter with its ``InternalVariables`` or
-    None; and forces on the particles.
+    None; forces on the particles; and ``suspension`` (``SuspensionKernels``), a mass on a thread, or None.
 
     They act in this order. ``acting``: bit e is set if function e acts, the bit after the last if forces do.
     """
 
-    def __init__(self, mpm, on_nodes, on_ground, on_stress):
+    def __init__(self, mpm, on_nodes, on_ground, on_stress, suspension=None):
         self.mpm = mpm
+        self.suspension, self.suspends = suspension, suspension is not None
         self.functions = [e[0] for e in (*on_nodes, *on_ground, *on_stress)]
         self.sizes = [e[1] for e in (*on_nodes, *on_ground, *on_stress)]
         self.remembers = [e[2] is not None for e in on_stress]
@@ -159,6 +166,12 @@ class ForwardEffects:
         """Forces act on the velocities at the start of substep s, which G2P of the one before has written."""
         if self.acting[None] & (1 << self.all):
             self.mpm.velocity[s, p] += (self.mpm.constants[DT] / self.mpm.particle_mass[p]) * self.force[p]
+
+    @ti.func
+    def on_suspended(self, s: ti.i32, count: ti.i32):
+        """The mass on the thread, after the forces on all particles."""
+        if ti.static(self.suspends):
+            self.suspension.advance(s, count)
 
     # ---- for a substep in several launches ---------------------------------------------------------------------------
 

@@ -82,6 +82,7 @@ class SubstepKernels:
                     self.on_grid(t, s, begin, nodes, log, now)
                 for p in range(count):
                     self.to_particle(s, p)
+                self.effects.on_suspended(s + 1, count)
         else:
             ti.loop_config(block_dim=1)
             for t in range(self.mpm.chunks):
@@ -102,6 +103,10 @@ class SubstepKernels:
             self.effects.node_update(n, log, self.mpm.sum_of_two(time, time_rest))
         for p in range(count):
             self.to_particle(s, p)
+        if ti.static(self.effects.suspends):
+            ti.loop_config(serialize=True)
+            for _ in range(1):
+                self.effects.on_suspended(s + 1, count)
 
     def advance(self, begin: int, end: int, count: int, nodes: int, log: int, time: float) -> None:
         """Substeps begin … end - 1, a single one if not ``serial``; log: first entry of the grid of ``begin``; time [s]

@@ -13,7 +13,7 @@ import torch
 
 from masiv import runtime
 from masiv.effects.active import ActiveEffects
-from masiv.effects.effect import ContactEffect, NodalEffect, StressEffect
+from masiv.effects.effect import ContactEffect, NodalEffect, StressEffect, SuspendedMassEffect
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.local_gradient import local_gradients
 from masiv.materials.law import Law
@@ -40,7 +40,8 @@ class SpringRollout:
     """A rollout of ``steps`` substeps of particles that springs connect (``masiv.mpm.spring_graph``).
 
     mass (N,) [kg] without effects; time [s] of the start. Effects on the nodes of the grid act on the particles.
-    Raises MasivError for an effect on the stress: springs have none; and for springs that need too short a substep.
+    Raises MasivError for an effect on the stress, which springs do not have, for a suspended mass, and for springs that
+    need too short a substep.
     """
 
     def __init__(
@@ -64,6 +65,8 @@ class SpringRollout:
                     f"effect {effect.name} acts on the stress, which springs do not have: choose another law"
                 )
             self.members.append(effect)
+        if effects is not None and effects.of_kind(SuspendedMassEffect):
+            raise MasivError("springs carry no suspended mass: choose another law")
         self.effects = SpringEffects(
             effects.coefficients() if effects else [],
             effects.force() if effects else None,

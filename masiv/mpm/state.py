@@ -16,8 +16,9 @@ class State:
     """Particles at one instant, simulation frame: position, velocity (N, 3) [m, m/s]; affine_velocity (N, 3, 3) [1/s];
     trial_gradient (N, 3, 3), the elastic deformation gradient before the return mapping. internal_variables (N, K) of
     the effect that has some (``HistoryEffect``); None: the body has been in its shape for long. rest_position
-    (N, 3) [m]: where the particles of a body of springs are at rest; None: at ``position``. A rollout has no gradient
-    by these two."""
+    (N, 3) [m]: where the particles of a body of springs are at rest; None: at ``position``. suspended (2, 3) [m, m/s]:
+    position and velocity of the mass that hangs from the body (``SuspendedMassEffect``); None: it hangs straight down
+    and moves with the body. A rollout has no gradient by these three."""
 
     position: torch.Tensor
     velocity: torch.Tensor
@@ -25,6 +26,7 @@ class State:
     trial_gradient: torch.Tensor
     internal_variables: torch.Tensor | None = None
     rest_position: torch.Tensor | None = None
+    suspended: torch.Tensor | None = None
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
         return self.position, self.velocity, self.affine_velocity, self.trial_gradient

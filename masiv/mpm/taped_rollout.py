@@ -99,6 +99,7 @@ class TapedRollout:
         state = State(
             *(t.detach().to(self.dtype).contiguous() for t in initial.tensors()),
             internal_variables=None if known is None else known.detach().to(self.dtype).contiguous(),
+            suspended=initial.suspended,
         )
         length = min(self.kernels.capacity_steps, self.steps)
         for start in range(0, self.steps, length):
@@ -116,7 +117,7 @@ class TapedRollout:
         """The state at local substep s of the segment that is in the fields."""
         out = State.empty(self.count, self.dtype)
         self.kernels.read_state(s, *out.tensors())
-        return replace(out, internal_variables=self.effects.read_internal(s))
+        return replace(out, internal_variables=self.effects.read_internal(s), suspended=self.effects.read_suspended(s))
 
     def read_stress(self, s: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Elastic deformation gradient and Kirchhoff stress [Pa], (N, 3, 3), in local substep s of the segment that is
@@ -134,6 +135,7 @@ class TapedRollout:
         self.kernels.owner = self
         self.kernels.write_state(0, *segment.initial.tensors())
         self.effects.write_internal(segment.initial.internal_variables, segment.start == 0)
+        self.effects.write_suspended(segment.initial.suspended)
         for begin in range(0, segment.length, WINDOW_EVERY):
             self._block(segment, begin, min(begin + WINDOW_EVERY, segment.length))
 
