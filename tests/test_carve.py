@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ring_scene import spheres_scene
+from ring_scene import ring, spheres_scene
 
 from masiv.errors import InputError, MasivError
 from masiv.hull.carve import visual_hull
-from masiv.hull.silhouette import sample_bilinear, signed_distance
+from masiv.hull.silhouette import sample_bilinear, signed_distance, silhouettes
 
 CENTRE, RADIUS = np.array([0.15, 0.5, -0.1]), 0.25
 
@@ -91,3 +91,27 @@ def test_held_out_frames_and_views_are_never_read():
     assert {frame for _, frame in read} == {1}
     with pytest.raises(InputError):
         visual_hull(scene, 2)
+
+
+def test_large_masks_are_averaged_down_and_carve_the_same(monkeypatch):
+    """Distances in metres agree to an averaged pixel, and what hides the scene still does."""
+
+    def hide(view, frame, mask):
+        shown = np.ones(mask.shape, bool)
+        shown[:, : mask.shape[1] // 3] = view != 0
+        return mask, shown
+
+    scene = spheres_scene(one_sphere, cameras=ring(size=431, focal=700.0), spoil=hide)
+    small, large = (silhouettes(scene, 0, resolution) for resolution in (8, None))
+    assert {s.distance.shape for s in large} == {(431, 431)}
+    assert all(32 <= np.sqrt((s.distance < 0).sum() * 4 / np.pi) < 64 for s in small)
+    points = CENTRE + np.random.default_rng(0).uniform(-0.4, 0.4, (2000, 3))
+    for reduced, whole in zip(small, large, strict=True):
+        (near, _, visible), (far, _, known) = reduced.distances(points), whole.distances(points)
+        both, pixel = visible & known, 2.5 / reduced.camera.intrinsics[0, 0]
+        assert both.sum() > 0.95 * known.sum()
+        assert not (visible & ~known).any()
+        assert np.abs(near - far)[both].max() < pixel
+    hull = visual_hull(scene, 0, resolution=16)
+    monkeypatch.setattr("masiv.hull.silhouette.PIXELS_A_VOXEL", 1000)
+    assert hull.volume == pytest.approx(visual_hull(scene, 0, resolution=16).volume, rel=0.03)

@@ -46,7 +46,7 @@ class Consistency:
 def silhouette_consistency(scene: Scene) -> Consistency:
     """The consistency of the cameras of ``scene`` that are not held out. Reads every picture."""
     cameras = [scene.cameras[view] for view in scene.views]
-    by_frame = [[outline(scene.frame(view, frame)) for view in scene.views] for frame in range(scene.frame_count)]
+    by_frame = [scene.map_views(frame, lambda _, picture: outline(picture)) for frame in range(scene.frame_count)]
     outlines = [list(own) for own in zip(*by_frame, strict=True)]
     return consistency(scene.views, pair_errors(cameras, outlines))
 

@@ -9,7 +9,7 @@ modeling using the t distribution", JASA 84, 1989).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -70,7 +70,9 @@ def calibrate_from_silhouettes(scene: Scene, prior: CalibrationPrior) -> Silhoue
     """
     frames = _chosen_frames(scene.observed_frames)
     cameras = [scene.cameras[view] for view in scene.views]
-    outlines = [[outline(scene.load(view, frame)) for frame in frames] for view in scene.views]
+    given = replace(scene, correct_masks=None)
+    by_frame = [given.map_views(frame, lambda _, picture: outline(picture)) for frame in frames]
+    outlines = [list(own) for own in zip(*by_frame, strict=True)]
     offsets = np.array([scene.time_offset(view) for view in scene.views])
     return fit_silhouettes(cameras, outlines, frames, scene.fps, prior, offsets)
 

@@ -25,7 +25,7 @@ def images_against(
     for frame in range(scene.frame_count):
         with torch.no_grad():
             moved = points + network.displacements(start, torch.tensor([frame / scene.fps]))[0].double().numpy()
-        views = silhouettes(scene, frame)
+        views = silhouettes(scene, frame, config.fill_resolution)
         pixel = np.inf
         for view in views:
             distance, _, visible = view.distances(moved)

@@ -126,7 +126,7 @@ def density_field(
     margin = 2
     lower = hull.points.min(axis=0) - margin * spacing
     index = np.rint((hull.points - lower) / spacing).astype(int)
-    views = silhouettes(scene, frame)
+    views = silhouettes(scene, frame, config.fill_resolution)
     outside = _outside_of_masks(views, hull.points, 0.25 * spacing)
     for depth in depth_views(scene, frame, views):
         outside = np.maximum(outside, np.maximum(depth.outside(hull.points), depth.behind(hull.points)))

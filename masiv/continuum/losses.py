@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from masiv.array_file import ArrayFile
-from masiv.hull.silhouette import silhouettes
+from masiv.hull.silhouette import PIXELS_A_VOXEL, silhouettes
 from masiv.scene.scene import Ground, Scene
 from masiv.scene.shutter import INSTANT, Shutter
 
@@ -59,9 +59,10 @@ class StoredViews(Sequence[View]):
 
 def load_views(scene: Scene, first: int = 0) -> list[StoredViews]:
     """The masks of all views that are not held out, of each frame from ``first`` on. They are in one file."""
-    file = ArrayFile()
+    file, resolution = ArrayFile(), _LARGEST_SIDE // PIXELS_A_VOXEL
     return [
-        StoredViews(file, (_view(s) for s in silhouettes(scene, frame))) for frame in range(first, scene.frame_count)
+        StoredViews(file, (_view(s) for s in silhouettes(scene, frame, resolution)))
+        for frame in range(first, scene.frame_count)
     ]
 
 

@@ -161,7 +161,7 @@ def first_mirror(scene: Scene, config: TrajectoryConfig, progress: Progress = si
     progress("symmetry", 0, 1)
     plane = mirror_plane(hull, None if given is None else np.array(given))
     tighter = symmetric_hull(hull, plane)
-    against = contradicting(silhouettes(scene, 0), hull, tighter)
+    against = contradicting(silhouettes(scene, 0, config.fill_resolution), hull, tighter)
     if against and given is not None:
         raise InputError(
             f"trajectory.symmetry: the masks of view {against[0]} at frame 0 contradict a mirror plane with the normal "

@@ -33,6 +33,11 @@ class VisualHull:
         """Volume of the hull [m³]."""
         return len(self.points) * self.spacing**3
 
+    @property
+    def resolution(self) -> int:
+        """Voxels along the longest side."""
+        return round(float(np.ptp(self.points, axis=0).max()) / self.spacing) + 1
+
 
 def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull:
     """Carve the hull of the object at ``frame`` from the masks of all views that are not held out.
@@ -43,7 +48,7 @@ def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull
     one view suffices, and the hidden side is a guess (``masiv.hull.depth``). Raises MasivError if fewer than two masks
     show the object, fewer than one with depth, or no voxel is left.
     """
-    views = silhouettes(scene, frame)
+    views = silhouettes(scene, frame, resolution)
     depths = depth_views(scene, frame, views)
     occupied_views = [v for v in views if (v.distance < 0).any()]
     if len(occupied_views) < 2 and (not depths or not occupied_views):

@@ -30,7 +30,7 @@ def remove_shadow_volume(scene: Scene, frame: int, hull: VisualHull, volume: flo
         return hull
     if (hull.points @ ground.normal).min() - ground.height > _CONTACT_TOLERANCE * hull.spacing:
         return hull
-    views = silhouettes(scene, frame)
+    views = silhouettes(scene, frame, hull.resolution)
     kept = keep_lowest_voxels(hull.points, hull.spacing, views, ground.normal, MAX_VOLUME_RATIO * volume)
     points = hull.points[kept]
     index = np.rint((points - points.min(axis=0)) / hull.spacing).astype(int)

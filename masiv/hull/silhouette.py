@@ -9,7 +9,11 @@ import numpy as np
 
 from masiv.hull.distance import distance_to_zero
 from masiv.scene.camera import Camera
-from masiv.scene.scene import Scene
+from masiv.scene.scene import Frame, Scene
+
+PIXELS_A_VOXEL = 4
+"""Of a mask along the side of a hull's voxel, at least, if it is averaged down: a hull's tolerance, a quarter of a
+voxel, is a pixel."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +66,18 @@ class Silhouette:
         return np.where(visible, pixel_distance * metres_per_pixel, 0.0), inside_image, visible
 
 
-def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
-    """The silhouettes of ``frame`` in every view that is not held out."""
-    pictures = ((view, scene.cameras[view], scene.frame(view, frame)) for view in scene.views)
-    found = (silhouette(view, camera, p.mask, p.valid) for view, camera, p in pictures)
+def silhouettes(scene: Scene, frame: int, resolution: int | None = None) -> tuple[Silhouette, ...]:
+    """The silhouettes of ``frame`` in every view that is not held out.
+
+    resolution: of a hull [voxels]. Masks with many more pixels than it needs are averaged down (``PIXELS_A_VOXEL``);
+    not if there is depth, which is compared pixel by pixel. None: every pixel is kept.
+    """
+    side = None if resolution is None or scene.depth_noise is not None else PIXELS_A_VOXEL * resolution
+
+    def of(view: int, picture: Frame) -> Silhouette:
+        return silhouette(view, *_reduced(scene.cameras[view], picture.mask, picture.valid, side))
+
+    found = scene.map_views(frame, of)
     if scene.velocities is None:
         return tuple(found)
     velocity = scene.velocities[frame]
@@ -78,6 +90,23 @@ def silhouettes(scene: Scene, frame: int) -> tuple[Silhouette, ...]:
 def silhouette(view: int, camera: Camera, mask: np.ndarray, valid: np.ndarray) -> Silhouette:
     """The silhouette of ``mask`` (H, W) in [0, 1]."""
     return Silhouette(view, camera, signed_distance(mask), _confidence(mask), valid)
+
+
+def _reduced(
+    camera: Camera, mask: np.ndarray, valid: np.ndarray, side: int | None
+) -> tuple[Camera, np.ndarray, np.ndarray]:
+    """``mask`` and ``valid`` (H, W), averaged over the largest blocks with which the box around the object keeps a
+    length of ``side`` pixels; with their camera."""
+    longest = 0 if side is None else max(cv2.boundingRect((mask > 0.5).astype(np.uint8))[2:])
+    factor = 1 if side is None else min(longest // side, *mask.shape)
+    if factor < 2:
+        return camera, mask, valid
+    smaller = camera.reduced(factor)
+    size = smaller.width, smaller.height
+    whole = slice(0, size[1] * factor), slice(0, size[0] * factor)
+    averaged = cv2.resize(mask[whole].astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    share = cv2.resize(valid[whole].astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return smaller, averaged, share > 1 - 1e-4
 
 
 def _confidence(mask: np.ndarray) -> np.ndarray:

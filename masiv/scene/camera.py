@@ -54,6 +54,14 @@ class Camera:
         intrinsics[1, 2] -= y0
         return replace(self, width=width, height=height, intrinsics=intrinsics, shutter=self.shutter.cropped(y0))
 
+    def reduced(self, factor: int) -> Camera:
+        """The camera of an image averaged over factor x factor blocks, whole ones. All of K scales, since pixel centres
+        are at +0.5."""
+        intrinsics = self.intrinsics.copy()
+        intrinsics[:2] /= factor
+        width, height = self.width // factor, self.height // factor
+        return replace(self, width=width, height=height, intrinsics=intrinsics, shutter=self.shutter.reduced(factor))
+
 
 def check_cameras(cameras: Sequence[Camera], where: str) -> None:
     """Raises InputError if intrinsics are not those of a pinhole camera, a camera is further away than anything that is

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,32 +36,36 @@ class Frame:
 
 
 class FrameCache:
-    """``load(view, frame)``, which reads a ``Frame``, with the frames that were read last, at most ``max_bytes``."""
+    """``load(view, frame)``, which reads a ``Frame``, with the frames read last, at most ``max_bytes``. Threads may
+    share it."""
 
     def __init__(self, load: Callable[[int, int], Frame], max_bytes: int = MAX_BYTES) -> None:
         self.load = load
         self.max_bytes = max_bytes
         self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
         self._bytes = 0
+        self._lock = threading.Lock()
 
     def __call__(self, view: int, frame: int) -> Frame:
         """The frame, read again if it was dropped."""
         key = view, frame
-        if key in self._frames:
-            self._frames.move_to_end(key)
-            return self._frames[key]
+        with self._lock:
+            if key in self._frames:
+                self._frames.move_to_end(key)
+                return self._frames[key]
         found = self.load(view, frame)
         self.put(view, frame, found)
         return found
 
     def put(self, view: int, frame: int, found: Frame) -> None:
         """Keep a frame that was read otherwise."""
-        self._bytes -= self._frames[view, frame].nbytes if (view, frame) in self._frames else 0
-        self._frames[view, frame] = found
-        self._bytes += found.nbytes
-        while self._bytes > self.max_bytes and len(self._frames) > 1:
-            _, oldest = self._frames.popitem(last=False)
-            self._bytes -= oldest.nbytes
+        with self._lock:
+            self._bytes -= self._frames[view, frame].nbytes if (view, frame) in self._frames else 0
+            self._frames[view, frame] = found
+            self._bytes += found.nbytes
+            while self._bytes > self.max_bytes and len(self._frames) > 1:
+                _, oldest = self._frames.popitem(last=False)
+                self._bytes -= oldest.nbytes
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled without its frames: another process reads those that it needs."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from masiv.scene.cloud import Cloud
 from masiv.scene.depth import DepthNoise
 from masiv.scene.frame_cache import Frame, FrameCache
 
+T = TypeVar("T")
 MaskedReader = Callable[[int, int, np.ndarray], Frame]
 """(view, frame, mask (H, W) float32) -> the picture with this mask."""
 
@@ -122,6 +125,13 @@ class Scene:
         if not 0 <= frame < self.frame_count or view not in self.views:
             raise InputError(f"view {view}, frame {frame} of {self.path} is held out from this stage or does not exist")
         return self.load(view, frame) if self.correct_masks is None else self._corrected(view, frame)
+
+    def map_views(self, frame: int, function: Callable[[int, Frame], T]) -> list[T]:
+        """``function(view, picture)`` of each view of ``frame`` that is not held out, in a thread a core."""
+        if self.correct_masks is not None and self.views:
+            self.frame(self.views[0], frame)  # makes those of all views
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            return list(threads.map(lambda view: function(view, self.frame(view, frame)), self.views))
 
     @cached_property
     def _corrected(self) -> FrameCache:

@@ -65,15 +65,15 @@ def summarise(scene: Scene, look: Callable[[int, int, Frame], None] = _ignore) -
     seen = np.zeros(coverage.shape, bool)
     known: list[float] = []
     for frame in range(scene.frame_count):
-        for row, view in enumerate(scene.views):
-            picture = scene.frame(view, frame)
+        pictures = scene.map_views(frame, lambda _, picture: picture)
+        for row, (view, picture) in enumerate(zip(scene.views, pictures, strict=True)):
             seen[row, frame] = picture.valid.any()
             coverage[row, frame] = picture.mask.mean()
             if picture.depth is not None and coverage[row, frame] > 0:
                 known.append(float((picture.depth[picture.mask > 0.5] > 0).mean()))
             look(view, frame, picture)
     problems = [*scene.problems, *_coverage_problems(scene, coverage, seen)]
-    pictures = dict(zip(scene.views, seen.sum(axis=1).tolist(), strict=True))
+    of_views = dict(zip(scene.views, seen.sum(axis=1).tolist(), strict=True))
     coverage = coverage[seen] if seen.any() else coverage
     return {
         "scene": str(scene.path),
@@ -90,7 +90,7 @@ def summarise(scene: Scene, look: Callable[[int, int, Frame], None] = _ignore) -
                 "focal_px": [float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])],
                 "principal_point_px": [float(camera.intrinsics[0, 2]), float(camera.intrinsics[1, 2])],
                 "position_m": camera.centre.tolist(),
-                "frames": pictures.get(view, 0),
+                "frames": of_views.get(view, 0),
                 "consistency_px": None,
                 "mask_agreement": None,
                 "mask_doubt": None,

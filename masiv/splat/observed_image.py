@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import overload
 
 import cv2
@@ -14,7 +15,7 @@ import torch
 from masiv.array_file import ArrayFile
 from masiv.errors import MasivError
 from masiv.scene.camera import Camera
-from masiv.scene.scene import Scene
+from masiv.scene.scene import Frame, Scene
 from masiv.splat.config import ReconstructConfig
 
 _NEAR_PIXELS = 3
@@ -113,14 +114,15 @@ def observed_images(scene: Scene, config: ReconstructConfig, frames: Iterable[in
     """
     found, observed, file = [], set(scene.observed_frames), ArrayFile()
     for frame in frames:
-        of_frame = [
-            observed_image(scene, view, frame, crop_side=config.crop_side, crop_padding=config.crop_padding)
-            for view in scene.views
-        ]
+        of_frame = scene.map_views(frame, partial(_of_view, scene, config, frame))
         found.append(StoredImages(file, (image for image in of_frame if image is not None)))
         if not found[-1] and frame in observed:
             raise MasivError(f"frame {frame} of {scene.path}: no view shows the object; check its masks")
     return found
+
+
+def _of_view(scene: Scene, config: ReconstructConfig, frame: int, view: int, _picture: Frame) -> ObservedImage | None:
+    return observed_image(scene, view, frame, crop_side=config.crop_side, crop_padding=config.crop_padding)
 
 
 def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_padding: int) -> ObservedImage | None:
@@ -156,7 +158,7 @@ def observed_image(scene: Scene, view: int, frame: int, *, crop_side: int, crop_
     divisor = np.maximum(visible, 1e-6)
     return ObservedImage(
         scene.views.index(view),
-        _reduced_camera(camera.cropped(x0, y0, width * factor, height * factor), factor),
+        camera.cropped(x0, y0, width * factor, height * factor).reduced(factor),
         torch.from_numpy(_average(colour, factor) / divisor[..., None]),
         torch.from_numpy(_average(mask, factor) / divisor),
         torch.from_numpy(visible),
@@ -199,16 +201,3 @@ def _average(image: np.ndarray, factor: int) -> np.ndarray:
         return np.ascontiguousarray(image)
     height, width = image.shape[0] // factor, image.shape[1] // factor
     return image.reshape(height, factor, width, factor, *image.shape[2:]).mean(axis=(1, 3))
-
-
-def _reduced_camera(camera: Camera, factor: int) -> Camera:
-    """The camera of an image averaged over factor x factor blocks. All of K scales, since pixel centres are at +0.5."""
-    intrinsics = camera.intrinsics.copy()
-    intrinsics[:2] /= factor
-    return replace(
-        camera,
-        width=camera.width // factor,
-        height=camera.height // factor,
-        intrinsics=intrinsics,
-        shutter=camera.shutter.reduced(factor),
-    )
