@@ -36,7 +36,7 @@ def bar(thickness: float = THICKNESS, length: float = LENGTH, gravity: float = 9
     declared = GeometryDeclaration(units="m", box=(thickness, thickness, length))
     geometry = make_geometry(declared, Path())
     clamp = Clamp(np.array([[0.0, 0.0, 1.0]]), np.array([-length / 2]), ())
-    body = TrackedBody("bar", "bar", geometry, DENSITY, DENSITY * geometry.volume, None, clamp)
+    body = TrackedBody("bar", "bar", geometry, DENSITY, DENSITY * geometry.volume, None, (clamp,))
     tip = np.array([0.0, 0.0, length])
     placement = Placement(np.eye(3), np.array([0.0, 0.0, length / 2]))
     run = Run("tip", "bar", "", "fit", ("tip",), np.array([0.0, 1.0, 2.0]), np.tile(tip, (3, 1, 1)), 1.0, slice(0, 3),

@@ -26,7 +26,7 @@ def scene(positions, times, *, ground=None, mass=0.06, diameter=0.065, clamp=Non
     geometry = make_geometry(GeometryDeclaration.model_validate(shape), Path())
     body = TrackedBody(
         "body", "body", geometry if known else None, mass / geometry.volume if known else None,
-        mass if known else None, None, clamp,
+        mass if known else None, None, () if clamp is None else (clamp,),
     )  # fmt: skip
     names = tuple(f"m{k}" for k in range(positions.shape[1]))
     at_rest = positions[0] if own is None else own

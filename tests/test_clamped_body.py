@@ -38,8 +38,9 @@ def heavier(tracks):
 
 def with_lower_clamp(tracks):
     (name,) = tracks.bodies
-    clamp = replace(tracks.bodies[name].clamp, heights=tracks.bodies[name].clamp.heights + 0.02)
-    return replace(tracks, bodies={name: replace(tracks.bodies[name], clamp=clamp)})
+    (clamp,) = tracks.bodies[name].clamps
+    lower = replace(clamp, heights=clamp.heights + 0.02)
+    return replace(tracks, bodies={name: replace(tracks.bodies[name], clamps=(lower,))})
 
 
 CHANGES = {

@@ -148,7 +148,7 @@ def test_pictures_and_markers_give_the_same_answers():
     run = Run(
         "run", "body", "", "fit", names, motion.times, places, FPS, None, places[0], None, None, None
     )  # fmt: skip
-    body = TrackedBody("body", "body", None, None, 14.0, None, None)
+    body = TrackedBody("body", "body", None, None, 14.0, None)
     marked = track_motion(Tracks(Path("tracks"), UP, G, ground, {"body": body}, (run,)), run)
     filmed = scene_motion(scene)
     assert verdicts(marked) == verdicts(filmed)

@@ -18,10 +18,13 @@ from masiv.materials.classical import ClassicalLaw
 from masiv.models.marked_body import placed_body
 from masiv.mpm.config import SimulatorConfig
 from masiv.pipeline import Overrides, SimulateRequest
+from masiv.tracks.config import TracksConfig
 from masiv.tracks.placement import Placement
 from masiv.tracks.prescribed_motion import PrescribedMotion, prescribed_motion
 from masiv.tracks.read import read_tracks
 from masiv.tracks.tracks import Clamp
+from masiv.twin import Body, Boundary
+from masiv.twin.from_tracks import twin_of_tracks
 
 UP = np.array([0.0, 1.0, 0.0])
 CONFIG = SMALL.model_copy(update={"particles_per_cell": 8, "courant_number": 0.4, "max_substeps_per_frame": 2000})
@@ -31,16 +34,19 @@ THIN = ClassicalLaw("neo_hookean", youngs_modulus=YOUNGS, poissons_ratio=0.0)
 TIP = np.array([[LENGTH - 0.0125, 0.05, 0.05]])
 
 
-def bar(motion, *, turned=None, gravity=(0.0, 0.0, 0.0), marker=TIP):
-    """A bar along x whose first 0.1 m are in the clamp; turned: of its own axes."""
+FIRST = Clamp(np.array([[1.0, 0.0, 0.0]]), np.array([HELD]), (), True)
+
+
+def bar(*motions, turned=None, gravity=(0.0, 0.0, 0.0), marker=TIP, clamps=(FIRST,)):
+    """A bar along x whose first 0.1 m are in a clamp; turned: of its own axes."""
     axis = np.arange(0.5 * SPACING, LENGTH, SPACING)
     across = np.arange(0.5 * SPACING, WIDTH, SPACING)
     own = np.stack(np.meshgrid(axis, across, across, indexing="ij"), -1).reshape(-1, 3)
     placement = Placement(np.eye(3) if turned is None else turned, np.zeros(3))
     return placed_body(
         own, LENGTH * WIDTH**2, DENSITY, CONFIG, particle_spacing=SPACING, placement=placement,
-        clamp=Clamp(np.array([[1.0, 0.0, 0.0]]), np.array([HELD]), (), True), at_rest=placement.to_world(marker),
-        markers=(0,), up=UP, gravity=np.array(gravity), ground=None, contact="none", speed=1.0, motion=motion,
+        clamps=clamps, at_rest=placement.to_world(marker),
+        markers=(0,), up=UP, gravity=np.array(gravity), ground=None, contact="none", speed=1.0, motions=motions,
     )  # fmt: skip
 
 
@@ -92,6 +98,51 @@ def test_a_stiff_bar_follows_its_clamp_through_turns():
     assert np.linalg.norm(world - expected, axis=2).max() < 0.03
 
 
+LAST = Clamp(np.array([[-1.0, 0.0, 0.0]]), np.array([HELD - LENGTH]), ())
+"""The other end of the bar, in a clamp that is fixed."""
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_wave_between_a_pushed_end_and_a_held_one_is_that_of_dalembert():
+    """Both ends turn its sign: u(x, t) = sum_n [u_0(t - (2 n L + x) / c) - u_0(t - ((2 n + 2) L - x) / c)]."""
+    push, knots, x = 1e-3, np.linspace(0, 0.5, 51), 0.4 * (LENGTH - 2 * HELD)
+    marker = np.array([[HELD + x, 0.05, 0.05]])
+    motion = motion_of(knots, push * hump(knots)[:, None] * [1.0, 0.0, 0.0])
+    body = bar(motion, None, marker=marker, clamps=(FIRST, LAST))
+    instants, positions = body.run(THIN, knots)
+    moved = body.markers_to_world(positions)[:, 0, 0] - marker[0, 0]
+    speed, length = math.sqrt(YOUNGS / DENSITY), LENGTH - 2 * HELD
+    ways = [(2 * n * length + x, (2 * n + 2) * length - x) for n in range(4)]
+    on_paper = push * sum(hump(instants - a / speed) - hump(instants - b / speed) for a, b in ways)
+    assert on_paper.min() < -0.8 * push
+    # on 12 cells, which are slower by 2 %
+    assert np.sqrt(np.mean((moved - on_paper) ** 2)) < 0.2 * np.sqrt(np.mean(on_paper**2))
+    end = body.particles[:, 0].argmax()
+    held = body.axes.points_to_world(positions.double().numpy())[:, end]
+    np.testing.assert_allclose(held, np.tile(held[0], (len(held), 1)), atol=1e-6)
+
+
+@pytest.mark.usefixtures("taichi")
+def test_a_bar_between_two_hands_follows_both():
+    """One end is carried about, the other along another path: its middle stays between them, as a cable's does."""
+    knots = np.linspace(0, 1.5, 76)
+    way = np.sin(0.5 * np.pi * knots / 1.5)[:, None] ** 2
+    paths = way * [0.1, 0.2, 0.0], way * [0.13, 0.1, 0.05]
+    carried_last = replace(LAST, prescribed=True)
+    middle = np.array([[0.5 * LENGTH, 0.05, 0.05]])
+    body = bar(*(motion_of(knots, path) for path in paths), marker=middle, clamps=(FIRST, carried_last))
+    stiff = ClassicalLaw("neo_hookean", youngs_modulus=1e5, poissons_ratio=0.3)
+    times = np.linspace(0, 1.5, 11)
+    instants, positions = body.run(stiff, times)
+    world = body.axes.points_to_world(positions.double().numpy())
+    for end, path in zip((world[0, :, 0].argmin(), world[0, :, 0].argmax()), paths, strict=True):
+        expected = np.stack([np.interp(instants, knots, p) for p in path.T], axis=1)
+        np.testing.assert_allclose(world[:, end] - world[0, end], expected, atol=1e-4)
+    between = np.stack([np.interp(instants, knots, p) for p in (0.5 * (paths[0] + paths[1])).T], axis=1)
+    moved = body.markers_to_world(positions)[:, 0] - middle
+    assert np.linalg.norm(moved - between, axis=1).max() < 0.01
+
+
 @pytest.mark.usefixtures("taichi")
 def test_it_hangs_at_rest_until_it_is_carried():
     still = motion_of(np.array([0.0, 0.1, 0.2, 0.3]), np.zeros((4, 3)))
@@ -111,7 +162,7 @@ def test_a_fluid_never_hangs_at_rest(monkeypatch):
     monkeypatch.setattr("masiv.models.marked_body.MAX_SETTLING", 3)
     still = motion_of(np.array([0.0, 0.1]), np.zeros((2, 3)))
     fluid = ClassicalLaw("newtonian", viscosity=5.0, bulk_modulus=2e4)
-    with pytest.raises(MasivError, match="does not come to rest in its clamp"):
+    with pytest.raises(MasivError, match="does not come to rest where it is held"):
         bar(still, gravity=(0.0, -9.8, 0.0)).run(fluid, np.linspace(0, 0.1, 2))
 
 
@@ -165,7 +216,7 @@ def scene_of(folder, *, names=("a", "b", "c"), noise=0.0, gap=None, own=None, st
 
 def path_of(folder):
     tracks = read_tracks(folder)
-    return prescribed_motion(tracks.runs[0], tracks.bodies["strip"].clamp)
+    return prescribed_motion(tracks.runs[0], tracks.bodies["strip"].clamps[0])
 
 
 def test_path_of_three_markers(tmp_path):
@@ -226,6 +277,45 @@ def test_what_a_carried_clamp_needs(tmp_path):
     assert read(lambda clamp, run: clamp.update(prescribed_motion=False)) is None
 
 
+def test_several_clamps_are_declared_and_kept_in_the_twin(tmp_path):
+    """A list of regions, each with its own markers; twin.yaml has them and their motions, one or several."""
+    scene = scene_of(tmp_path)
+    strip = scene["bodies"]["strip"]
+    lower = {"half_space": {"normal": [0, 1, 0], "height": -0.08}, "markers": []}
+    strip["clamp"] = [strip["clamp"], lower]
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scene))
+    tracks = read_tracks(tmp_path)
+    body = tracks.bodies["strip"]
+    assert [clamp.prescribed for clamp in body.clamps] == [True, False]
+    assert body.held_markers == ("a", "b", "c")
+    start = twin_of_tracks(tracks, TracksConfig(), CONFIG, rigid=False).initial_conditions[0]
+    first, second = start.release.motions
+    assert first is not None
+    assert second is None
+    for motions, clamps in (((first, None, first), (*body.clamps, body.clamps[0])), ((first,), body.clamps[:1])):
+        twin = masiv.Twin(
+            bodies=(Body("strip", 1e-6, 1e3, THIN, np.zeros((2, 3)), 0.01, clamps),), boundary=Boundary(),
+            gravity=np.zeros(3), up=UP,
+            initial_conditions=(replace(start, release=replace(start.release, motions=motions)),), simulator=CONFIG,
+        )  # fmt: skip
+        folder = tmp_path / str(len(motions))
+        folder.mkdir()
+        twin.save(folder)
+        again = masiv.Twin.load(folder)
+        for before, after in zip(clamps, again.body.clamps, strict=True):
+            np.testing.assert_array_equal(after.normals, before.normals)
+            np.testing.assert_array_equal(after.heights, before.heights)
+            assert (after.markers, after.prescribed) == (before.markers, before.prescribed)
+        for known, found in zip(motions, again.initial_conditions[0].release.motions, strict=True):
+            assert (known is None) == (found is None)
+            if known is not None:
+                np.testing.assert_array_equal(found.displacement, known.displacement)
+    lower["markers"] = ["a"]
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scene))
+    with pytest.raises(InputError, match="marker a is fixed to two clamps"):
+        read_tracks(tmp_path)
+
+
 # ---- the whole job --------------------------------------------------------------------------------------------------
 
 
@@ -233,7 +323,6 @@ def test_what_a_carried_clamp_needs(tmp_path):
 def test_stiffness_of_a_carried_strip(tmp_path):
     """Tracks of a simulation with three times the particles; then the law, the twin on disk, a rollout of it."""
     from masiv.models.marked_body import marked_body
-    from masiv.tracks.config import TracksConfig
     from masiv.twin.from_tracks import particle_spacing
 
     (tmp_path / "made").mkdir()
@@ -258,13 +347,13 @@ def test_stiffness_of_a_carried_strip(tmp_path):
     assert data["law"]["parameters"]["youngs_modulus"]["value"] == pytest.approx(8e4, rel=0.15)
     assert data["runs"][0]["before_mm"] < 2.0
     twin = masiv.Twin.load(tmp_path / "run")
-    motion = twin.initial_conditions[0].release.motion
+    (motion,) = twin.initial_conditions[0].release.motions
     np.testing.assert_array_equal(motion.displacement, path_of(tmp_path).displacement)
     run.simulate(SimulateRequest(frames=60), tmp_path / "again")
     rollout = np.load(tmp_path / "again" / "rollout.npz")
     sides = rollout["positions"][:, :, 0]
     assert np.ptp(sides.mean(axis=1)) > 0.05
-    with pytest.raises(InputError, match="the motion of the clamp is known for"):
+    with pytest.raises(InputError, match="the motion of a clamp is known for"):
         run.simulate(SimulateRequest(frames=500), tmp_path / "longer")
     assert torch.get_default_dtype() == torch.float32
     assert replace(motion, rotation=0 * motion.rotation).at(np.zeros(1))[0].shape == (1, 3, 3)

@@ -89,8 +89,8 @@ def test_read_in_metres_with_gaps_and_pose(folder):
     np.testing.assert_allclose(first.placement.translation, POSE[1], atol=1e-6)
     body = tracks.bodies["beam"]
     assert body.mass == pytest.approx(1100 * 9e-5, rel=1e-12)
-    np.testing.assert_allclose(body.clamp.normals, [[0, 0, 1]])
-    np.testing.assert_allclose(body.clamp.heights, [-0.04])
+    np.testing.assert_allclose(body.clamps[0].normals, [[0, 0, 1]])
+    np.testing.assert_allclose(body.clamps[0].heights, [-0.04])
     assert first.release == pytest.approx(0.2, abs=1e-3)
     assert [run.name for run in tracks.chosen("hold_out", condition="load")] == ["two"]
     assert tracks.chosen("fit", condition="load") == ()

@@ -106,7 +106,7 @@ def test_mass_and_place_in_the_simulator():
     assert body.mass == pytest.approx(1070 * 9e-5, rel=1e-6)
     assert body.context(1.0, 0.01).particle_mass * len(body.particles) == pytest.approx(body.mass, rel=1e-12)
     assert body.gravity == pytest.approx(np.array([0, -9.8, 0]))  # up is an axis of the grid
-    normal, height = body.normals[0].numpy(), body.heights[0].item()
+    normal, height = body.clamps[0].normals[0].numpy(), body.clamps[0].heights[0].item()
     along = np.abs(normal).argmax()
     assert height * normal[along] / body.spacing == pytest.approx(
         round(height * normal[along] / body.spacing), abs=1e-9
@@ -121,11 +121,13 @@ def test_clamp_holds_against_effects_and_has_no_part_in_gradients(taichi):
     """Within the clamp nothing moves at all, whatever acts there; the gradient of a drag beside it is right."""
     scene = bar()
     body = marked_body(scene, scene.runs[0], CONFIG, particle_spacing=7.5e-3)
-    body = replace(body, heights=body.heights + 0.045)
+    (clamp,) = body.clamps
+    clamp = replace(clamp, heights=clamp.heights + 0.045)
+    body = replace(body, clamps=(clamp,))
     law = ClassicalLaw("neo_hookean", youngs_modulus=5e4, poissons_ratio=0.3)
     substep = body.substep(law, np.array([0, 0.02]))
     steps = round(0.02 / substep)
-    depth = body.particles @ body.normals[0] - body.heights[0]
+    depth = body.particles @ clamp.normals[0] - clamp.heights[0]
 
     def moved(rate):
         active = body.effects(((effects()["linear_drag"], rate),), body.context(0.02, 0.02))

@@ -221,8 +221,8 @@ def test_a_static_deflection_strains_as_it_moves(bar):
     """F is the gradient of the displacement, and a section turns without shear."""
     run = next(r for r in bar.runs if r.name == "own_a")
     body = marked_body(bar, run, SIMULATOR, particle_spacing=5e-3)
-    axes = clamp_axes(body.gravity, body.normals)
-    x, gradient = static_deflection(body.particles, body.heights[0], axes, 2e-3)
+    axes = clamp_axes(body.gravity, body.clamps[0].normals)
+    x, gradient = static_deflection(body.particles, body.clamps[0].heights[0], axes, 2e-3)
     before = body.particles
     assert (x - before).norm(dim=1).max().item() == pytest.approx(2e-3, rel=0.15)
     n, e = axes

@@ -64,7 +64,7 @@ def bodies(draw, name):
     particles = (CORNERS + moved).astype(dtype)
     return Body(
         name, draw(volumes), draw(densities), draw(laws()), particles, draw(st.none() | positive),
-        draw(st.none() | st.just(clamp)), draw(st.none() | names), draw(st.none() | st.just(drag)),
+        draw(st.sampled_from([(), (clamp,), (clamp, clamp)])), draw(st.none() | names), draw(st.none() | st.just(drag)),
     )  # fmt: skip
 
 

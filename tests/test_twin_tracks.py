@@ -56,8 +56,7 @@ def test_what_a_scene_says_of_a_clamped_body(bar, held):
     assert body.volume == pytest.approx(9e-5)
     assert body.particles is not None
     assert body.particles.dtype == np.float64
-    assert body.clamp is not None
-    assert body.clamp.markers == ("base",)
+    assert [clamp.markers for clamp in body.clamps] == [("base",)]
     assert [(s.observation, s.condition) for s in held.initial_conditions] == [("own_a", ""), ("load_a", "load")]
     release = held.initial_conditions[0].release
     assert release is not None

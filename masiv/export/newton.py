@@ -62,12 +62,12 @@ def newton_scene(
     velocities = np.where(held[:, None], 0.0, start.velocity + np.cross(start.omega, arms))
     values, notes = newton_material(twin.law, None if material is None else material.get("quantities"))
     notes += ["the solver is implicit: contact and damping differ from the twin's, and impacts lose energy"]
-    if body.clamp is not None:
-        notes.append("the clamp holds particles up to a particle spacing away from it, in place of grid nodes inside")
+    if body.clamps:
+        notes.append("a clamp holds particles up to a particle spacing away from it, in place of grid nodes inside")
     if start.release is not None:
         notes.append("the body starts at rest in its undeformed shape: how it was held before its release is left out")
-        if start.release.motion is not None:
-            notes.append("the clamp does not move: the path along which it is carried is left out")
+        if start.release.motions:
+            notes.append("clamps do not move: the path along which one is carried is left out")
     gravity, shift = _exact_effects(twin)
     notes += [_left_out(effect) for effect in twin.effects if effect.name not in REPRESENTED]
     settings = {
@@ -85,10 +85,11 @@ def newton_scene(
 
 
 def _held(body: Body, own: np.ndarray, spacing: float) -> np.ndarray:
-    """Which particles (Q,) are held: those in the clamp or within a ``spacing`` [m] of it, own axes."""
-    if body.clamp is None:
-        return np.zeros(len(own), bool)
-    return replace(body.clamp, heights=body.clamp.heights + spacing).holds(own)
+    """Which particles (Q,) are held: those in a clamp or within a ``spacing`` [m] of it, own axes."""
+    held = np.zeros(len(own), bool)
+    for clamp in body.clamps:
+        held |= replace(clamp, heights=clamp.heights + spacing).holds(own)
+    return held
 
 
 def _ground(twin: Twin, shift: float) -> dict[str, Any] | None:

@@ -35,7 +35,7 @@ def track_motion(tracks: Tracks, run: Run) -> ObservedMotion | None:
     measured = noise_std(places[:, run.axes[list(chosen)]], MIN_NOISE)
     if run.noise_std is not None:
         measured = max(MIN_NOISE, float(np.sqrt(np.nanmean(run.noise_std[list(chosen)] ** 2))))
-    clamped = body.clamp is not None
+    clamped = bool(body.clamps)
     if clamped:
         shape = np.linalg.norm(places - np.nan_to_num(run.at_rest[list(chosen)]), axis=2)
     else:

@@ -37,7 +37,7 @@ def held_in(tracks: Tracks, run: Run) -> Held | None:
     gravity."""
     body, gravity = tracks.bodies[run.body], tracks.gravity
     size = float(np.linalg.norm(gravity))
-    if body.clamp is not None or size == 0 or (run.rest is not None and run.release is None):
+    if body.clamps or size == 0 or (run.rest is not None and run.release is None):
         return None
     chosen, places, times = observed_markers(tracks, run)
     if len(times) < FEWEST_FRAMES:

@@ -26,7 +26,7 @@ AUTO_FAMILIES = ("neo_hookean", "von_mises")
 
 def flight_group(tracks: Tracks) -> str | None:
     """The group of the bodies of a scene in free flight; None for one body. Raises InputError for several groups."""
-    if len(tracks.bodies) == 1 and next(iter(tracks.bodies.values())).clamp is not None:
+    if len(tracks.bodies) == 1 and next(iter(tracks.bodies.values())).clamps:
         return None
     groups = tracks.groups()
     if len(groups) == 1 and all(len(run.markers) == 1 for run in tracks.runs):

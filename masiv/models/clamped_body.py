@@ -147,7 +147,7 @@ class ClampedBodyModel(ForwardModel):
         its tip at the start (see ``static_deflection``) for the energy that they took or gave. If the body was not held
         straight, the deflection is that in which it was held, where its markers are at their places at rest. Nothing of
         a body whose clamp is carried: it is at rest there, and its markers at their places at rest."""
-        if self.body(run).motion is not None:
+        if self.body(run).carried:
             return ()
         names = ["lateral_offset_1", "lateral_offset_2"]
         deflection: tuple[Parameter, ...] = ()
@@ -287,7 +287,7 @@ class ClampedBodyModel(ForwardModel):
 
             found = self._rollout_cache.get(key, rolled_out)
         markers = found["markers"]
-        if (deflection and not run.skipped) or body.motion is not None:
+        if (deflection and not run.skipped) or body.carried:
             straight = body.markers_to_world(body.particles[None])[0]
             markers = markers - (markers[0] - straight)
         return CubicSpline(found["times"], markers)

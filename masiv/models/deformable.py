@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -27,13 +27,27 @@ from masiv.scene.transforms import SimulationFrame
 
 
 @dataclass(frozen=True)
+class HeldRegion:
+    """The intersection of half-spaces n · x ≤ h: normals (P, 3), heights (P,) [m]; simulation axes."""
+
+    normals: torch.Tensor
+    heights: torch.Tensor
+
+
+def with_clamps(effects: ActiveEffects, clamps: Sequence[HeldRegion]) -> ActiveEffects:
+    """``effects`` and after them a clamp of each region."""
+    for clamp in clamps:
+        effects = with_clamp(effects, clamp.normals, clamp.heights)
+    return effects
+
+
+@dataclass(frozen=True)
 class DeformableBody:
     """A body at rest, free or clamped.
 
     particles (N, 3) [m, simulation axes]; volume [m³]; density [kg/m³]; size [m]: the length that effects take for that
     of the body; axes: world -> simulation; gravity (3,) [m/s², simulation axes]; speed [m/s]: the greatest that the
-    substep allows for; normals (P, 3), heights (P,) [m, simulation axes]: half-spaces n · x ≤ h whose intersection is
-    held (P = 0: nothing is). max_substeps: states kept at once; a rollout is the same for any number.
+    substep allows for; clamps: what is held. max_substeps: states kept at once; a rollout is the same for any number.
     Raises ValueError for arrays of another shape.
     """
 
@@ -45,13 +59,11 @@ class DeformableBody:
     gravity: np.ndarray
     config: SimulatorConfig
     speed: float
-    normals: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
-    heights: torch.Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    clamps: tuple[HeldRegion, ...] = ()
     max_substeps: int = 1024
 
     def __post_init__(self) -> None:
-        planes = len(self.heights)
-        for name, shape in (("particles", (len(self.particles), 3)), ("gravity", (3,)), ("normals", (planes, 3))):
+        for name, shape in (("particles", (len(self.particles), 3)), ("gravity", (3,))):
             found = tuple(getattr(self, name).shape)
             if found != shape:
                 raise ValueError(f"a body's {name} has shape {found}, it must be {shape}")
@@ -74,13 +86,13 @@ class DeformableBody:
     @property
     def is_clamped(self) -> bool:
         """Whether a part of it is held."""
-        return len(self.heights) > 0
+        return bool(self.clamps)
 
     @cached_property
     def digest(self) -> str:
         """Of everything that a rollout depends on."""
         matter = (self.particles, self.volume, self.density, self.size, self.axes, self.gravity)
-        return content_hash((*matter, self.config.model_dump(), self.normals, self.heights))
+        return content_hash((*matter, self.config.model_dump(), self.clamps))
 
     def context(self, duration: float, frame_time: float, path: torch.Tensor | None = None) -> EffectContext:
         """What effects may know of the body. duration [s] of the recording; path (T, M, 3) [m]: where its points were
@@ -91,9 +103,8 @@ class DeformableBody:
         )  # fmt: skip
 
     def effects(self, members: Sequence[tuple[Effect, torch.Tensor]], context: EffectContext) -> ActiveEffects:
-        """Effects with their parameters, and after them the clamp."""
-        active = ActiveEffects(tuple(members), context)
-        return with_clamp(active, self.normals, self.heights) if self.is_clamped else active
+        """Effects with their parameters, and after them the clamps."""
+        return with_clamps(ActiveEffects(tuple(members), context), self.clamps)
 
     def substeps(self, law: Law, interval: float, effects: ActiveEffects | None = None) -> int:
         """The fewest equal substeps in ``interval`` [s] that ``law`` with ``effects`` is stable with. Raises MasivError

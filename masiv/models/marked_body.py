@@ -12,13 +12,13 @@ import numpy as np
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.boundary.clamp import with_clamp, with_moving_clamp
+from masiv.effects.boundary.clamp import with_moving_clamp
 from masiv.effects.context import EffectContext
 from masiv.effects.effect import Effect, HistoryEffect
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.materials.law import Law
 from masiv.models.attachment import Attachment, attach
-from masiv.models.deformable import DeformableBody, checked_instants
+from masiv.models.deformable import DeformableBody, HeldRegion, checked_instants, with_clamps
 from masiv.models.release import clamp_axes, static_deflection
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.rollout import at_rest
@@ -29,7 +29,7 @@ from masiv.scene.scene import Ground
 from masiv.scene.transforms import SimulationFrame
 from masiv.tracks.geometry import fill_geometry
 from masiv.tracks.placement import Placement
-from masiv.tracks.prescribed_motion import PrescribedMotion, prescribed_motion
+from masiv.tracks.prescribed_motion import PrescribedMotion, Segment, prescribed_motions
 from masiv.tracks.tracks import Clamp, Run, Tracks
 
 TILT_WEIGHT = 1e-3
@@ -48,28 +48,36 @@ class MarkedBody(DeformableBody):
     """A body that is let go from rest, with markers that are tied to its material.
 
     contact: with the ground; attachment: of ``markers``, the run's markers that move with the material (indices into
-    ``run.markers``). particles: float64. motion: of the clamp, if it is carried. Then the body is at rest in it before.
+    ``run.markers``). particles: float64. motions: of each clamp, None for one that is fixed; empty if none is carried.
+    If one is, the body is at rest in them before.
     """
 
     contact: str
     attachment: Attachment
     markers: tuple[int, ...]
-    motion: PrescribedMotion | None = None
+    motions: tuple[PrescribedMotion | None, ...] = ()
 
     @cached_property
     def digest(self) -> str:
         """See ``DeformableBody``."""
         own = super().digest
-        return own if self.motion is None else content_hash((own, self.motion))
+        return content_hash((own, self.motions)) if self.motions else own
+
+    @property
+    def carried(self) -> tuple[tuple[HeldRegion, PrescribedMotion], ...]:
+        """Clamps that move, and how."""
+        both = zip(self.clamps, self.motions, strict=True) if self.motions else ()
+        return tuple((clamp, motion) for clamp, motion in both if motion is not None)
 
     def effects(self, members: Sequence[tuple[Effect, torch.Tensor]], context: EffectContext) -> ActiveEffects:
-        """See ``DeformableBody``; without a clamp that is carried, which ``pieces`` adds."""
-        return super().effects(members, context) if self.motion is None else ActiveEffects(tuple(members), context)
+        """See ``DeformableBody``; without clamps that are carried, which ``pieces`` adds."""
+        fixed = [c for k, c in enumerate(self.clamps) if not self.motions or self.motions[k] is None]
+        return with_clamps(ActiveEffects(tuple(members), context), fixed)
 
     @property
     def clamp_axes(self) -> tuple[torch.Tensor, torch.Tensor] | None:
         """See ``masiv.models.release.clamp_axes``."""
-        return clamp_axes(self.gravity, self.normals)
+        return clamp_axes(self.gravity, self.clamps[0].normals) if len(self.clamps) == 1 else None
 
     def released(self, dtype: torch.dtype = torch.float32, deflection: float = 0.0) -> State:
         """State at the release: at rest. Stress-free if ``deflection`` [m] is 0, else deflected as by its weight."""
@@ -77,7 +85,7 @@ class MarkedBody(DeformableBody):
         gradient = torch.eye(3, dtype=x.dtype).expand(len(x), 3, 3)
         axes = self.clamp_axes
         if axes is not None and deflection != 0:
-            x, gradient = static_deflection(x, self.heights[0], axes, deflection)
+            x, gradient = static_deflection(x, self.clamps[0].heights[0], axes, deflection)
         still = torch.zeros_like(x, dtype=dtype)
         state = at_rest(x.to(dtype), still, torch.zeros_like(gradient, dtype=dtype))
         return replace(state, trial_gradient=gradient.to(dtype).contiguous(), rest_position=self.particles.to(dtype))
@@ -113,7 +121,7 @@ class MarkedBody(DeformableBody):
         effects = effects or self.effects((), self.context(float(times[-1]), interval))
         substep = substep or self.substep(law, times, effects)
         outputs = [round(float(t) / substep) for t in times]
-        if self.motion is None:
+        if not self.carried:
             state = self.released(dtype, deflection)
             positions = self.rollout(law, state, outputs, substep=substep, contact=self.contact, effects=effects)
             return np.array(outputs) * substep, positions
@@ -123,7 +131,7 @@ class MarkedBody(DeformableBody):
     def _carried(
         self, law: Law, outputs: Sequence[int], effects: ActiveEffects, substep: float, dtype: torch.dtype
     ) -> torch.Tensor:
-        """Positions (T, N, 3) after each of ``outputs`` substeps, of a body whose clamp moves."""
+        """Positions (T, N, 3) after each of ``outputs`` substeps, of a body with a clamp that moves."""
         simulator = self.simulator(substep, self.contact, dtype)
         state = self.at_start(simulator, law, effects, dtype)
         found = {0: state.position}
@@ -139,15 +147,15 @@ class MarkedBody(DeformableBody):
         return torch.stack([found[step] for step in outputs])
 
     def at_start(self, simulator: Simulator, law: Law, effects: ActiveEffects, dtype: torch.dtype) -> State:
-        """The state at the release: ``released``, or at rest in a clamp that will be carried."""
-        return self.released(dtype) if self.motion is None else self._settled(simulator, law, effects, dtype)
+        """The state at the release: ``released``, or at rest in clamps of which one will be carried."""
+        return self._settled(simulator, law, effects, dtype) if self.carried else self.released(dtype)
 
     def _settled(self, simulator: Simulator, law: Law, effects: ActiveEffects, dtype: torch.dtype) -> State:
-        """At rest in the clamp before it moves. By dynamic relaxation with kinetic damping (Cundall 1976): velocities
+        """At rest in the clamps before one moves. By dynamic relaxation with kinetic damping (Cundall 1976): velocities
         become zero whenever the kinetic energy passes a peak. Stresses that relax have done so. Raises MasivError if it
         does not come to rest."""
         lasting = tuple(m for m in effects.members if not isinstance(m[0], HistoryEffect))
-        acting = with_clamp(ActiveEffects(lasting, effects.context), self.normals, self.heights)
+        acting = with_clamps(ActiveEffects(lasting, effects.context), [clamp for clamp, _ in self.carried])
         state, before, highest = self.released(dtype), 0.0, 0.0
         for _ in range(MAX_SETTLING):
             # A mass on a thread hangs at rest again.
@@ -164,30 +172,38 @@ class MarkedBody(DeformableBody):
                 return state
             else:
                 before = energy
-        raise MasivError("a body that is carried does not come to rest in its clamp: is its law one of a solid?")
+        raise MasivError("a body that is carried does not come to rest where it is held: is its law one of a solid?")
 
     def pieces(
         self, effects: ActiveEffects, begin: int, end: int, substep: float
     ) -> Iterator[tuple[int, int, ActiveEffects]]:
-        """Substeps ``begin`` to ``end`` in parts, each with its effects: ``effects``, and the part of the motion of a
-        clamp that is carried; none if there is no substep."""
-        if self.motion is None:
-            if end > begin:
-                yield begin, end, effects
-            return
-        turn, centre = self.axes.rotation, self.axes.points_to_simulation(self.motion.centre)
-        at_rest = self.axes.vectors_to_world(self.normals.numpy())
-        heights = self.heights - torch.as_tensor(self.normals.numpy() @ centre)
-        for part in self.motion.segments(end * substep):
-            first, last = (min(max(round(t / substep), begin), end) for t in (part.start, part.stop))
-            if first == last:
-                continue
-            position = part.position @ turn.T
-            position[0] += self.axes.translation
-            yield first, last, with_moving_clamp(
-                effects, part.start, torch.as_tensor(position), torch.as_tensor(turn @ part.omega),
-                torch.as_tensor(self.axes.vectors_to_simulation(at_rest @ part.rotation.T)), heights,
-            )  # fmt: skip
+        """Substeps ``begin`` to ``end`` in parts, each with its effects: ``effects``, and the parts of the motions of
+        clamps that are carried; none if there is no substep."""
+        parts = [
+            (clamp, motion, part, round(part.start / substep), round(part.stop / substep))
+            for clamp, motion in self.carried
+            for part in motion.segments(end * substep)
+        ]
+        ends = {begin, end, *(s for *_, first, last in parts for s in (first, last) if begin < s < end)}
+        for first, last in itertools.pairwise(sorted(ends)):
+            acting = effects
+            for clamp, motion, part, start, stop in parts:
+                if start <= first < stop:
+                    acting = self._with_carried(acting, clamp, motion, part)
+            yield first, last, acting
+
+    def _with_carried(
+        self, effects: ActiveEffects, clamp: HeldRegion, motion: PrescribedMotion, part: Segment
+    ) -> ActiveEffects:
+        turn, centre = self.axes.rotation, self.axes.points_to_simulation(motion.centre)
+        at_rest = self.axes.vectors_to_world(clamp.normals.numpy())
+        position = part.position @ turn.T
+        position[0] += self.axes.translation
+        return with_moving_clamp(
+            effects, part.start, torch.as_tensor(position), torch.as_tensor(turn @ part.omega),
+            torch.as_tensor(self.axes.vectors_to_simulation(at_rest @ part.rotation.T)),
+            clamp.heights - torch.as_tensor(clamp.normals.numpy() @ centre),
+        )  # fmt: skip
 
 
 def mean_interval(times: np.ndarray) -> float:
@@ -219,7 +235,7 @@ def marked_body(
         config,
         particle_spacing=particle_spacing,
         placement=run.placement,
-        clamp=body.clamp,
+        clamps=body.clamps,
         at_rest=run.at_rest[list(free)],
         markers=free,
         up=tracks.up,
@@ -227,7 +243,7 @@ def marked_body(
         ground=tracks.ground,
         contact=contact if tracks.ground is not None else "none",
         speed=speed,
-        motion=None if body.clamp is None else prescribed_motion(run, body.clamp),
+        motions=prescribed_motions(run, body.clamps),
     )
 
 
@@ -239,7 +255,7 @@ def placed_body(
     *,
     particle_spacing: float,
     placement: Placement,
-    clamp: Clamp | None,
+    clamps: tuple[Clamp, ...],
     at_rest: np.ndarray,
     markers: tuple[int, ...],
     up: np.ndarray,
@@ -247,24 +263,22 @@ def placed_body(
     ground: Ground | None,
     contact: str,
     speed: float,
-    motion: PrescribedMotion | None = None,
+    motions: tuple[PrescribedMotion | None, ...] = (),
 ) -> MarkedBody:
     """Particles ``own`` (N, 3) [m, own axes], ``particle_spacing`` [m] apart, at a place in the world, and markers tied
     to them that are ``at_rest`` (M, 3) [m, world]. volume [m³]; density [kg/m³]; up (3,) and gravity (3,) [m/s²]:
-    world; speed [m/s]: see ``DeformableBody``. motion: of the clamp, if it is carried.
+    world; speed [m/s]: see ``DeformableBody``. motions: see ``MarkedBody``.
 
     The grid holds ``config.particles_per_cell`` of them a cell. Without a ground it runs along the body's own axes, a
-    plane of its nodes in each face of the clamp's first plane, so that neither is blurred.
+    plane of its nodes in the first plane of the first clamp, which is then not blurred.
     """
     axes = _along_body(placement.rotation, up) if ground is None else SimulationFrame.from_scene(up, ground)
-    normals, heights = np.zeros((0, 3)), np.zeros(0)
-    if clamp is not None:
-        in_world = clamp.normals @ placement.rotation.T
-        heights = clamp.heights + in_world @ placement.translation
-        normals = axes.vectors_to_simulation(in_world)
-        heights = heights + normals @ axes.translation
+    in_world = [clamp.normals @ placement.rotation.T for clamp in clamps]
+    normals = [axes.vectors_to_simulation(n) for n in in_world]
+    heights = [clamp.heights + n @ placement.translation for clamp, n in zip(clamps, in_world, strict=True)]
     if ground is None:
-        axes, heights = _on_nodes(axes, placement.to_world(own), normals, heights)
+        plane = (normals[0][0], heights[0][0] + normals[0][0] @ axes.translation) if clamps else None
+        axes = _on_nodes(axes, placement.to_world(own), plane)
     particles = axes.points_to_simulation(placement.to_world(own))
     return MarkedBody(
         particles=torch.as_tensor(particles),
@@ -275,13 +289,15 @@ def placed_body(
         gravity=axes.vectors_to_simulation(gravity),
         config=config,
         speed=speed,
-        normals=torch.as_tensor(normals),
-        heights=torch.as_tensor(heights),
+        clamps=tuple(
+            HeldRegion(torch.as_tensor(n), torch.as_tensor(h + n @ axes.translation))
+            for n, h in zip(normals, heights, strict=True)
+        ),
         max_substeps=256,
         contact=contact,
         attachment=attach(particles, axes.points_to_simulation(at_rest), particle_spacing),
         markers=markers,
-        motion=motion,
+        motions=motions,
     )
 
 
@@ -298,14 +314,14 @@ def _along_body(rotation: np.ndarray, up: np.ndarray) -> SimulationFrame:
     return SimulationFrame(best, np.zeros(3))
 
 
-def _on_nodes(
-    axes: SimulationFrame, world: np.ndarray, normals: np.ndarray, heights: np.ndarray
-) -> tuple[SimulationFrame, np.ndarray]:
-    """Shift ``axes`` so that nodes lie in the first plane of the clamp, and in the body's middle otherwise."""
+def _on_nodes(axes: SimulationFrame, world: np.ndarray, plane: tuple[np.ndarray, float] | None) -> SimulationFrame:
+    """Shift ``axes`` so that nodes lie in ``plane``, its normal (3,) and height [m] along it, and in the middle of the
+    points ``world`` (N, 3) [m] along other axes."""
     points = axes.points_to_simulation(world)
     shift = -0.5 * (points.max(0) + points.min(0))
-    if len(heights):
-        along = int(np.abs(normals[0]).argmax())
-        if abs(normals[0, along]) > 1 - 1e-6:
-            shift[along] = -heights[0] * np.sign(normals[0, along])
-    return SimulationFrame(axes.rotation, axes.translation + shift), heights + normals @ shift
+    if plane is not None:
+        normal, height = plane
+        along = int(np.abs(normal).argmax())
+        if abs(normal[along]) > 1 - 1e-6:
+            shift[along] = -height * np.sign(normal[along])
+    return SimulationFrame(axes.rotation, axes.translation + shift)

@@ -94,7 +94,7 @@ def flight_observations(tracks: Tracks, group: str) -> tuple[TracksObservation, 
 
 
 def _flight(tracks: Tracks, run: Run) -> TracksObservation:
-    if len(run.markers) != 1 or tracks.bodies[run.body].clamp is not None:
+    if len(run.markers) != 1 or tracks.bodies[run.body].clamps:
         raise InputError(
             f"{tracks.path}: run {run.name}: a body of a group flies free and has one marker, its middle: "
             "choose it with markers, and leave out the clamp"

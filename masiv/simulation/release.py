@@ -25,11 +25,10 @@ def simulate_release(
     if frames < 2:
         raise InputError(f"--frames {frames}: give at least 2")
     times = np.arange(frames) / fps
-    if release.motion is not None and times[-1] > release.motion.times[-1] + 1 / fps:
-        known = int(release.motion.times[-1] * fps) + 1
-        raise InputError(
-            f"--frames {frames}: the motion of the clamp is known for {known} frames: give as many at most"
-        )
+    last = min((motion.times[-1] for motion in release.motions if motion is not None), default=np.inf)
+    if times[-1] > last + 1 / fps:
+        known = int(last * fps) + 1
+        raise InputError(f"--frames {frames}: the motion of a clamp is known for {known} frames: give as many at most")
     members = effect_members(twin, twin.body)
     effects = body.effects(members, body.context(float(times[-1]), 1 / fps))
     causes = [effect for effect, _ in members if accelerates(effect)]
@@ -73,7 +72,7 @@ def released_body(twin: Twin) -> MarkedBody:
         twin.simulator,
         particle_spacing=body.particle_spacing,
         placement=start.placement,
-        clamp=body.clamp,
+        clamps=body.clamps,
         at_rest=np.array(list(markers.values())),
         markers=tuple(range(len(markers))),
         up=twin.up,
@@ -81,5 +80,5 @@ def released_body(twin: Twin) -> MarkedBody:
         ground=twin.ground,
         contact=twin.contact,
         speed=start.release.max_speed,
-        motion=start.release.motion,
+        motions=start.release.motions,
     )

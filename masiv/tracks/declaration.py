@@ -96,8 +96,8 @@ class GeometryDeclaration(_Part):
 class BodyDeclaration(_Part):
     """One object.
 
-    ``density`` [kg/m³] or ``mass`` [kg]. ``group``: bodies of a group share the effects of their environment, for
-    example drag; by default a body is its own group.
+    ``density`` [kg/m³] or ``mass`` [kg]. ``clamp``: what is held, one region or a list of several. ``group``: bodies of
+    a group share the effects of their environment, for example drag; by default a body is its own group.
     """
 
     geometry: GeometryDeclaration | None = None
@@ -105,13 +105,20 @@ class BodyDeclaration(_Part):
     mass: Annotated[float, MASS.field()] | None = None
     poissons_ratio: Annotated[FiniteFloat, Field(gt=-1, lt=0.5)] | None = None
     group: str | None = None
-    clamp: ClampDeclaration | None = None
+    clamp: tuple[ClampDeclaration, ...] = ()
+
+    @field_validator("clamp", mode="before")
+    @classmethod
+    def _one_or_several(cls, value: object) -> object:
+        if value is None:
+            return ()
+        return [value] if isinstance(value, dict) else value
 
     @model_validator(mode="after")
     def _consistent(self) -> BodyDeclaration:
         if self.density is not None and self.mass is not None:
             raise ValueError("give density or mass, not both")
-        if self.clamp is not None and self.geometry is None:
+        if self.clamp and self.geometry is None:
             raise ValueError("a clamp needs a geometry")
         return self
 

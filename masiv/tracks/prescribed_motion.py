@@ -89,6 +89,11 @@ class PrescribedMotion:
         return tuple(out)
 
 
+def prescribed_motions(run: Run, clamps: tuple[Clamp, ...]) -> tuple[PrescribedMotion | None, ...]:
+    """``prescribed_motion`` of each of ``clamps``; () if all are fixed."""
+    return tuple(prescribed_motion(run, clamp) for clamp in clamps) if any(c.prescribed for c in clamps) else ()
+
+
 def prescribed_motion(run: Run, clamp: Clamp) -> PrescribedMotion | None:
     """How the markers of ``clamp`` carry it in ``run``, from its release on; None for one that is fixed.
 

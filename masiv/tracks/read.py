@@ -15,8 +15,8 @@ from masiv.bounds import FPS, LENGTH, TIME
 from masiv.errors import InputError
 from masiv.scene.layout import Layout
 from masiv.strict import read_yaml, validated
-from masiv.tracks.declaration import METRES, BodyDeclaration, RunDeclaration, TracksDeclaration
-from masiv.tracks.geometry import Geometry, make_geometry
+from masiv.tracks.declaration import METRES, BodyDeclaration, ClampDeclaration, RunDeclaration, TracksDeclaration
+from masiv.tracks.geometry import Geometry, fill_geometry, make_geometry
 from masiv.tracks.placement import Placement, best_rigid
 from masiv.tracks.point_table import Table
 from masiv.tracks.release import estimate_release
@@ -65,22 +65,39 @@ def read_tracks(folder: Path) -> Tracks:
 
 
 def _body(name: str, declared: BodyDeclaration, folder: Path) -> TrackedBody:
-    geometry, clamp = None, None
+    geometry, clamps = None, ()
     density, mass = declared.density, declared.mass
     if declared.geometry is not None:
         geometry = make_geometry(declared.geometry, folder)
         density = mass / geometry.volume if mass is not None else density
         mass = density * geometry.volume if density is not None else None
-        clamp = _clamp(name, declared, geometry)
+        clamps = _clamps(name, declared, geometry)
     group = name if declared.group is None else declared.group
-    return TrackedBody(name, group, geometry, density, mass, declared.poissons_ratio, clamp)
+    return TrackedBody(name, group, geometry, density, mass, declared.poissons_ratio, clamps)
 
 
-def _clamp(name: str, body: BodyDeclaration, geometry: Geometry) -> Clamp | None:
-    declared = body.clamp
-    if declared is None or body.geometry is None:
-        return None
+def _clamps(name: str, body: BodyDeclaration, geometry: Geometry) -> tuple[Clamp, ...]:
+    assert body.geometry is not None
     unit = METRES[body.geometry.units]
+    clamps = tuple(_clamp(name, declared, unit, geometry) for declared in body.clamp)
+    if (
+        clamps
+        and _all_held(clamps, geometry.vertices)
+        and _all_held(clamps, fill_geometry(geometry, geometry.size / 20))
+    ):
+        raise InputError(f"scene.yaml: bodies.{name}.clamp holds the whole body: nothing is free to move")
+    several = [marker for clamp in clamps for marker in clamp.markers]
+    for marker in set(several):
+        if several.count(marker) > 1:
+            raise InputError(f"scene.yaml: bodies.{name}.clamp: marker {marker} is fixed to two clamps: choose one")
+    return clamps
+
+
+def _all_held(clamps: tuple[Clamp, ...], points: np.ndarray) -> bool:
+    return bool(np.any([clamp.holds(points) for clamp in clamps], axis=0).all())
+
+
+def _clamp(name: str, declared: ClampDeclaration, unit: float, geometry: Geometry) -> Clamp:
     if declared.half_space is not None:
         normal = np.array(declared.half_space.normal)
         length = np.linalg.norm(normal)
@@ -100,8 +117,6 @@ def _clamp(name: str, body: BodyDeclaration, geometry: Geometry) -> Clamp | None
             f"scene.yaml: bodies.{name}.clamp holds no part of the geometry, which spans {_extent(geometry)} m in "
             "its own axes: correct its numbers"
         )
-    if clamp.holds(touched).all():
-        raise InputError(f"scene.yaml: bodies.{name}.clamp holds the whole body: nothing is free to move")
     return clamp
 
 
@@ -135,8 +150,8 @@ def _run(
                 f"scene.yaml: {where}: rest_frames end at {run.rest_frames[1]}, the run has {len(times)} frames"
             )
         rest = slice(*run.rest_frames)
-    clamped = bodies[body].clamp
-    for marker in clamped.markers if clamped else ():
+    held = bodies[body].held_markers
+    for marker in held:
         if marker not in markers:
             problems.append(f"{where}: marker {marker} of the clamp is not in it")
     if run.release_time is not None and not times[0] <= run.release_time < times[-1]:
@@ -148,7 +163,7 @@ def _run(
         if np.isnan(at_rest[m][np.isfinite(positions[:, m]).any(axis=0)]).any():
             problems.append(f"{where}: marker {marker} is not seen at rest, so it is not tied to the body")
     release = run.release_time
-    carried = clamped is not None and clamped.prescribed
+    carried = any(clamp.prescribed for clamp in bodies[body].clamps)
     if carried and run.ignore_after_release:
         raise InputError(f"scene.yaml: {where}: ignore_after_release is for a clamp that does not move: leave it out")
     if carried and release is None:  # the clamp moves first, and then the body
@@ -156,7 +171,7 @@ def _run(
             raise InputError(f"scene.yaml: {where}: its clamp moves: give rest_frames, or release_time before it does")
         release = float(times[rest.stop - 1])
     if rest is not None and noise is not None and release is None:
-        free = [m for m, marker in enumerate(markers) if not (clamped and marker in clamped.markers)]
+        free = [m for m, marker in enumerate(markers) if marker not in held]
         release = estimate_release(times, positions[:, free], rest, at_rest[free], noise[free])
         if release is None:
             problems.append(f"{where}: it never leaves its rest position by more than the noise: no release found")

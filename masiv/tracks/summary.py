@@ -34,7 +34,7 @@ def summarise_tracks(tracks: Tracks) -> dict[str, Any]:
                 "density_kg_m3": body.density,
                 "mass_kg": body.mass,
                 "poissons_ratio": body.poissons_ratio,
-                "clamp_markers": None if body.clamp is None else list(body.clamp.markers),
+                "clamp_markers": list(body.held_markers) if body.clamps else None,
             }
             for body in tracks.bodies.values()
         ],

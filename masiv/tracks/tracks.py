@@ -43,11 +43,16 @@ class TrackedBody:
     density: float | None
     mass: float | None
     poissons_ratio: float | None
-    clamp: Clamp | None
+    clamps: tuple[Clamp, ...] = ()
+
+    @property
+    def held_markers(self) -> tuple[str, ...]:
+        """Those fixed to a clamp."""
+        return tuple(marker for clamp in self.clamps for marker in clamp.markers)
 
     def free_markers(self, run: Run) -> tuple[int, ...]:
-        """Markers of ``run`` that are not fixed to the clamp and are known at rest in all three axes."""
-        held = () if self.clamp is None else self.clamp.markers
+        """Markers of ``run`` that are not fixed to a clamp and are known at rest in all three axes."""
+        held = self.held_markers
         return tuple(m for m, name in enumerate(run.markers) if name not in held and np.isfinite(run.at_rest[m]).all())
 
 

@@ -26,7 +26,7 @@ class Body:
 
     particles (Q, 3) [m] at rest, in world axes, or in the body's own axes if its initial conditions have a placement
     (None: a rigid body is a point mass). particle_spacing [m]: with which they were filled in, if it is not
-    (volume / Q)^(1/3). clamp: what is held, own axes. geometry: kind of the solid that was declared. drag: the body as
+    (volume / Q)^(1/3). clamps: what is held, own axes. geometry: kind of the solid that was declared. drag: the body as
     the medium sees it.
     """
 
@@ -36,7 +36,7 @@ class Body:
     law: Law | None = None
     particles: np.ndarray | None = None
     particle_spacing: float | None = None
-    clamp: Clamp | None = None
+    clamps: tuple[Clamp, ...] = ()
     geometry: str | None = None
     drag: DragBody | None = None
 
@@ -75,14 +75,14 @@ class Release:
     """The start of a body that is held at rest and then let go.
 
     markers: rest position (3,) [m] of each marker that moves with the material. max_speed [m/s]: the greatest that was
-    observed, from which the substep follows. offsets: what was fitted of the start, see ``OFFSET_UNITS``. motion: that
-    of the clamp, if it is carried.
+    observed, from which the substep follows. offsets: what was fitted of the start, see ``OFFSET_UNITS``. motions: of
+    each clamp of the body, None for one that is fixed; empty if none is carried.
     """
 
     markers: dict[str, np.ndarray]
     max_speed: float
     offsets: dict[str, float] = field(default_factory=dict)
-    motion: PrescribedMotion | None = None
+    motions: tuple[PrescribedMotion | None, ...] = ()
 
 
 @dataclass(frozen=True)

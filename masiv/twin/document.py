@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from masiv.bounds import LENGTH
 from masiv.errors import InputError
@@ -32,6 +32,17 @@ SAME_LAW = 1e-4
 
 Unit = TypeVar("Unit")
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Entry = TypeVar("Entry")
+
+
+def _one_or_several(value: object) -> object:
+    if value is None:
+        return []
+    return [value] if isinstance(value, dict) else value
+
+
+Several = Annotated[list[Entry], BeforeValidator(_one_or_several)]
+"""A list, a single entry of it, or null for an empty one."""
 FileName = Annotated[str, Field(pattern=r"^[^/\\]+$")]
 
 
@@ -107,7 +118,7 @@ class BodyPart(Part):
     volume: Positive[Literal["m^3"]]
     density: Positive[Literal["kg/m^3"]]
     geometry: str | None = None
-    clamp: ClampPart | None = None
+    clamp: Several[ClampPart] = []
     drag: DragPart | None = None
 
 
@@ -150,7 +161,7 @@ class ReleasePart(Part):
     markers: dict[str, Vector3[Literal["m"]]]
     max_speed: Scalar[Literal["m/s"]]
     offsets: OffsetsPart
-    motion: MotionPart | None = None
+    motion: Several[MotionPart | None] = []
 
 
 class InitialConditionPart(Part):
@@ -218,17 +229,19 @@ def write_document(twin: Mapping[str, Any], folder: Path, name: str = TWIN_FILE)
 
 
 def _body_entry(body: Body, law_file: str, particles_file: str) -> dict[str, Any]:
-    particles, clamp, drag = None, None, None
+    particles, drag = None, None
     if body.particles is not None:
         spacing = None if body.particle_spacing is None else _quantity(body.particle_spacing, "m")
         particles = {"file": particles_file, "tensor": body.name, "spacing": spacing}
-    if body.clamp is not None:
-        clamp = {
-            "normals": [_floats(normal) for normal in body.clamp.normals],
-            "heights": _floats(body.clamp.heights),
-            "markers": list(body.clamp.markers),
-            **({"prescribed": True} if body.clamp.prescribed else {}),
+    clamps = [
+        {
+            "normals": [_floats(normal) for normal in clamp.normals],
+            "heights": _floats(clamp.heights),
+            "markers": list(clamp.markers),
+            **({"prescribed": True} if clamp.prescribed else {}),
         }
+        for clamp in body.clamps
+    ]
     if body.drag is not None:
         drag = {
             "diameter": _quantity(body.drag.diameter, "m"),
@@ -243,7 +256,7 @@ def _body_entry(body: Body, law_file: str, particles_file: str) -> dict[str, Any
         "volume": _quantity(body.volume, "m^3"),
         "density": _quantity(body.density, "kg/m^3"),
         "geometry": body.geometry,
-        "clamp": clamp,
+        "clamp": (clamps if len(clamps) > 1 else clamps[0]) if clamps else None,
         "drag": drag,
     }
 
@@ -254,9 +267,16 @@ MOTION_TENSORS = ("times", "displacement", "rotation")
 
 def _motion_tensors(starts: Sequence[InitialCondition]) -> dict[str, np.ndarray]:
     return {
-        f"{start.observation}.{name}": np.ascontiguousarray(getattr(start.release.motion, name), np.float64)
-        for start in starts if start.release is not None and start.release.motion is not None for name in MOTION_TENSORS
+        f"{_motion_tensor(start, k)}.{name}": np.ascontiguousarray(getattr(motion, name), np.float64)
+        for start in starts if start.release is not None
+        for k, motion in enumerate(start.release.motions) if motion is not None
+        for name in MOTION_TENSORS
     }  # fmt: skip
+
+
+def _motion_tensor(start: InitialCondition, clamp: int) -> str:
+    """Name of the tensors of the motion of one clamp."""
+    return f"{start.observation}.{clamp}" if clamp else start.observation
 
 
 def _initial_condition_entry(start: InitialCondition, motion_file: str) -> dict[str, Any]:
@@ -273,9 +293,13 @@ def _initial_condition_entry(start: InitialCondition, motion_file: str) -> dict[
             "max_speed": _quantity(start.release.max_speed, "m/s"),
             "offsets": {name: _quantity(value, OFFSET_UNITS[name]) for name, value in start.release.offsets.items()},
         }
-        if start.release.motion is not None:
-            centre = _quantity(start.release.motion.centre, "m")
-            release["motion"] = {"file": motion_file, "tensor": start.observation, "centre": centre}
+        motions = [
+            None if motion is None
+            else {"file": motion_file, "tensor": _motion_tensor(start, k), "centre": _quantity(motion.centre, "m")}
+            for k, motion in enumerate(start.release.motions)
+        ]  # fmt: skip
+        if motions:
+            release["motion"] = motions[0] if len(motions) == 1 else motions
     return {
         "observation": start.observation,
         "body": start.body,
@@ -367,18 +391,18 @@ def _body(part: BodyPart, where: str, folder: Path) -> Body:
         spacing = None if part.particles.spacing is None else part.particles.spacing.value
     if law is not None and particles is None:
         raise InputError(f"{where}.particles' is missing: a body that deforms consists of particles")
-    clamp = None
-    if part.clamp is not None:
-        if len(part.clamp.normals) != len(part.clamp.heights):
+    clamps = []
+    for held in part.clamp:
+        if len(held.normals) != len(held.heights):
             raise InputError(f"{where}.clamp' needs one height for each normal")
-        normals = np.array(part.clamp.normals).reshape(-1, 3)
-        clamp = Clamp(normals, np.array(part.clamp.heights), tuple(part.clamp.markers), part.clamp.prescribed)
+        normals = np.array(held.normals).reshape(-1, 3)
+        clamps.append(Clamp(normals, np.array(held.heights), tuple(held.markers), held.prescribed))
     drag = None
     if part.drag is not None:
         d = part.drag
         drag = DragBody(d.diameter.value, d.mass.value, d.medium_density.value, d.medium_viscosity.value)
     return Body(
-        part.name, part.volume.value, part.density.value, law, particles, spacing, clamp, part.geometry, drag
+        part.name, part.volume.value, part.density.value, law, particles, spacing, tuple(clamps), part.geometry, drag
     )  # fmt: skip
 
 
@@ -432,8 +456,8 @@ def _initial_condition(part: InitialConditionPart, folder: Path) -> InitialCondi
     if part.release is not None:
         offsets = {name: offset.value for name, offset in part.release.offsets if offset is not None}
         markers = {name: np.array(place.value) for name, place in part.release.markers.items()}
-        motion = None if part.release.motion is None else _motion(part.release.motion, folder)
-        release = Release(markers, part.release.max_speed.value, offsets, motion)
+        motions = tuple(None if motion is None else _motion(motion, folder) for motion in part.release.motion)
+        release = Release(markers, part.release.max_speed.value, offsets, motions)
     return InitialCondition(
         part.observation, part.body, part.fps, np.array(part.velocity.value), np.array(part.omega.value),
         part.condition, placement, release,

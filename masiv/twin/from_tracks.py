@@ -10,7 +10,7 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.tracks.config import TracksConfig
 from masiv.tracks.geometry import fill_geometry, mean_diameter
 from masiv.tracks.placement import Placement
-from masiv.tracks.prescribed_motion import prescribed_motion
+from masiv.tracks.prescribed_motion import prescribed_motions
 from masiv.tracks.tracks import Run, TrackedBody, Tracks
 from masiv.twin.body import Body, Boundary, InitialCondition, Release
 from masiv.twin.twin import Twin
@@ -55,7 +55,7 @@ def _body(tracks: Tracks, body: TrackedBody, config: TracksConfig, rigid: bool) 
         return Body(body.name, volume, body.density, geometry=body.geometry.kind, drag=drag)
     spacing = particle_spacing(volume, config)
     particles = fill_geometry(body.geometry, spacing)
-    return Body(body.name, volume, body.density, None, particles, spacing, body.clamp, body.geometry.kind, drag)
+    return Body(body.name, volume, body.density, None, particles, spacing, body.clamps, body.geometry.kind, drag)
 
 
 def _flight(run: Run) -> InitialCondition:
@@ -73,8 +73,7 @@ def _release(tracks: Tracks, run: Run, config: TracksConfig) -> InitialCondition
     free = tracks.bodies[run.body].free_markers(run)
     _, _, speed = run.released(free, run.ignore_after_release, config.duration)
     markers = {run.markers[m]: run.at_rest[m] for m in free}
-    clamp = tracks.bodies[run.body].clamp
-    release = Release(markers, speed, motion=None if clamp is None else prescribed_motion(run, clamp))
+    release = Release(markers, speed, motions=prescribed_motions(run, tracks.bodies[run.body].clamps))
     return InitialCondition(
         run.name, run.body, run.rate, np.zeros(3), np.zeros(3), run.condition, run.placement, release
     )  # fmt: skip

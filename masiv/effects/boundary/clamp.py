@@ -8,7 +8,7 @@ import taichi as ti
 import torch
 
 from masiv.effects.active import ActiveEffects
-from masiv.effects.boundary.planes import PlanesEffect, with_planes
+from masiv.effects.boundary.planes import PlanesEffect, earlier, with_planes
 from masiv.effects.context import EffectParameter
 from masiv.effects.effect import NodalEffect
 
@@ -95,8 +95,8 @@ class MovingClamp(NodalEffect):
 
 
 @functools.cache
-def _moving_clamp(planes: int) -> MovingClamp:
-    """One object for each number of planes: kernels are compiled for the object."""
+def _moving_clamp(planes: int, which: int) -> MovingClamp:
+    """One object for each number of planes and number in a rollout: kernels are compiled for the object."""
     return MovingClamp(planes)
 
 
@@ -113,4 +113,5 @@ def with_moving_clamp(
     planes = torch.cat([normals, heights[:, None]], dim=1).reshape(-1)
     first = torch.tensor([start], dtype=position.dtype)
     values = torch.cat([first, position.reshape(-1), omega, planes.to(position.dtype)]).detach()
-    return ActiveEffects((*effects.members, (_moving_clamp(len(heights)), values)), effects.context)
+    effect = _moving_clamp(len(heights), earlier(effects, MovingClamp, len(heights)))
+    return ActiveEffects((*effects.members, (effect, values)), effects.context)

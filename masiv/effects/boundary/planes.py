@@ -8,7 +8,7 @@ import torch
 
 from masiv.effects.active import ActiveEffects
 from masiv.effects.context import EffectParameter
-from masiv.effects.effect import NodalEffect
+from masiv.effects.effect import Effect, NodalEffect
 
 
 class PlanesEffect(NodalEffect):
@@ -25,9 +25,14 @@ class PlanesEffect(NodalEffect):
 
 
 @functools.cache
-def _planes_effect(kind: type[PlanesEffect], planes: int) -> PlanesEffect:
-    """One object for each kind and number of planes: kernels are compiled for the object."""
+def _planes_effect(kind: type[PlanesEffect], planes: int, which: int) -> PlanesEffect:
+    """One object for each kind, number of planes and number in a rollout: kernels are compiled for the object."""
     return kind(planes)
+
+
+def earlier(effects: ActiveEffects, kind: type[Effect], planes: int) -> int:
+    """How many of ``kind`` with so many ``planes`` there are."""
+    return sum(isinstance(effect, kind) and getattr(effect, "planes", 0) == planes for effect, _ in effects.members)
 
 
 def with_planes(
@@ -38,4 +43,5 @@ def with_planes(
     normals (P, 3): unit vectors; heights (P,) [m]; simulation frame.
     """
     planes = torch.cat([normals, heights[:, None]], dim=1).detach().reshape(-1)
-    return ActiveEffects((*effects.members, (_planes_effect(kind, len(heights)), planes)), effects.context)
+    effect = _planes_effect(kind, len(heights), earlier(effects, kind, len(heights)))
+    return ActiveEffects((*effects.members, (effect, planes)), effects.context)

@@ -22,7 +22,7 @@ def twin_section(page: Page, twin: Twin) -> None:
 
 def _rows(twin: Twin) -> list[list[Any]]:
     rows: list[list[Any]] = []
-    free = [body for body in twin.bodies if body.particles is not None and body.clamp is None]
+    free = [body for body in twin.bodies if body.particles is not None and not body.clamps]
     if len(free) == len(twin.bodies) == 1:
         rows += [
             ["initial velocity", twin.velocity.tolist(), "m/s", None],
