@@ -3,7 +3,7 @@
     python tests/arch_results.py ARCH FILE.npz [GROUP ...]
 
 Groups: laws (a rollout with each law), gradients (of rollouts with each contact), effects (all of them, a rollout and
-its gradients), picture. Float32; a number has the same meaning on every arch.
+its gradients if it has any), picture. Float32; a number has the same meaning on every arch.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from random_gaussians import BACKGROUND, make_camera, make_gaussians, weighted
 from masiv import runtime
 from masiv.effects.active import ActiveEffects
 from masiv.effects.catalogue import effects
-from masiv.effects.effect import ContactEffect
+from masiv.effects.effect import ContactEffect, SuspendedMassEffect
 from masiv.materials.classical import ClassicalLaw
 from masiv.materials.neural import NeuralLaw
 from masiv.models.initial_state import rigid_initial_state
@@ -77,11 +77,19 @@ def of_effects() -> Results:
     x = body().to(F32)
     library, out = effects(), {}
     on_ground = [name for name, e in library.items() if isinstance(e, ContactEffect)]
-    anywhere = [name for name in library if name not in on_ground]
+    # A rollout with a suspended mass has no gradient.
+    hanging = [name for name, e in library.items() if isinstance(e, SuspendedMassEffect)]
+    anywhere = [name for name in library if name not in on_ground + hanging]
     for name in on_ground:  # one contact may act at a time
         members = tuple((library[n], present(library[n])) for n in (*anywhere, name))
         parts = thrown(elastic(), "slip", ActiveEffects(members, setting(x)))
         out |= {f"all effects, {name} {part}": v for part, v in zip(("end", "start", "values"), parts, strict=True)}
+    for name in hanging:
+        sim = simulator(len(x), dtype=F32)
+        active = ActiveEffects(((library[name], present(library[name])),), setting(x))
+        start = rigid_initial_state(x, torch.tensor([0.6, -1.2, 0.3]), torch.tensor([2.0, 1.0, -3.0]))
+        taken = sim.run(start, elastic(), STEPS, [STEPS], active)
+        out[name] = torch.cat([taken.positions[0], taken.final.suspended])
     return out
 
 
