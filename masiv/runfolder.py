@@ -24,6 +24,7 @@ from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError
 from masiv.files import check_motion, read_npz, remove_temporary, write_yaml
 from masiv.folder_lock import locked
+from masiv.memory import PeakMemory
 from masiv.scene.scene import Ground
 from masiv.strict import read_yaml, reason
 
@@ -199,18 +200,22 @@ class RunFolder:
 
     @contextmanager
     def stage(self, stage: str) -> Iterator[Checkpoint]:
-        """Record that ``stage`` runs, and on leaving without an error that it is done, and for how long it ran."""
+        """Record that ``stage`` runs, and on leaving without an error that it is done; for how long it ran and the
+        memory that it took with its processes."""
         state = self.record["stages"][stage]
         state["state"] = RUNNING
         state.setdefault("started", _now())
         self._write()
         began = time.monotonic()
         checkpoint = self.checkpoint(stage)
+        memory = PeakMemory()
         try:
-            yield checkpoint
+            with memory:
+                yield checkpoint
             state["state"], state["finished"] = DONE, _now()
         finally:
             state["seconds"] = round(state.get("seconds", 0.0) + time.monotonic() - began, 2)
+            state["peak_memory_mb"] = max(state.get("peak_memory_mb", 0), round(memory.bytes / 1e6))
             self._write()
         checkpoint.clear()
 

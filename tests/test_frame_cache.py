@@ -95,3 +95,13 @@ def test_inspect_makes_the_masks_of_a_frame_agree_once_however_long_the_recordin
     assert looked == [(frame, view) for frame in range(9) for view in range(3)]
     assert made == list(range(9))
     assert len(reader.read) == 27
+
+
+def test_released_pictures_are_read_again():
+    reader = Reader()
+    whole = scene(reader)
+    part = whole.restricted(2)
+    part.frame(1, 0)
+    whole.release_pictures()
+    part.frame(1, 0)
+    assert reader.read == [(1, 0), (1, 0)]

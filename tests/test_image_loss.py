@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from ball import ball_scene, ball_terms
 
 from masiv.identification.losses.images import ImageTerms
-from masiv.identification.losses.picture_window import particle_spacing, picture_window, render_particles, to_world
+from masiv.identification.losses.picture_window import (
+    PIXELS_A_PARTICLE,
+    particle_spacing,
+    picture_window,
+    render_particles,
+    to_world,
+)
+from masiv.scene.frame_cache import Frame
 
 pytestmark = pytest.mark.usefixtures("taichi")
 
@@ -44,8 +53,42 @@ def test_as_many_pixels_as_the_masks(terms):
     problem = terms.problem
     points, excess = to_world(problem, problem.particles), []
     for view in problem.scene.views:
-        window = picture_window(problem.scene, view, 0)
+        window = picture_window(problem, view, 0)
         with torch.no_grad():
             alpha = render_particles(window, points, terms.splat_sigma, torch.zeros(problem.count, 3)).alpha
         excess.append(float((alpha - window.mask).sum() / window.mask.sum()))
     assert np.mean(excess) == pytest.approx(0, abs=0.01)
+
+
+def enlarged(scene, factor):
+    """``scene`` with each pixel as a block of ``factor`` × ``factor``."""
+
+    def load(view, frame):
+        given = scene.load(view, frame)
+        parts = (given.image, given.mask, given.valid)
+        return Frame(*(part.repeat(factor, axis=0).repeat(factor, axis=1) for part in parts))
+
+    cameras = tuple(
+        dataclasses.replace(
+            camera, width=factor * camera.width, height=factor * camera.height,
+            intrinsics=np.diag([factor, factor, 1.0]) @ camera.intrinsics,
+        )
+        for camera in scene.cameras
+    )  # fmt: skip
+    return dataclasses.replace(scene, cameras=cameras, load=load)
+
+
+def test_large_pictures_are_averaged_down_to_what_the_particles_resolve(terms):
+    large = ball_terms(enlarged(terms.problem.scene, 8), particle_spacing(terms.problem))
+    problem = large.problem
+    for view in problem.scene.views:
+        window, plain = (picture_window(one.problem, view, 0) for one in (large, terms))
+        focal, plain_focal = (one.camera.intrinsics[0, 0] for one in (window, plain))
+        depth = plain.camera.project(to_world(problem, problem.particles).double().numpy().mean(0)[None])[1][0]
+        pixels = focal * particle_spacing(problem) / depth
+        assert PIXELS_A_PARTICLE <= pixels < 2 * PIXELS_A_PARTICLE
+        area, plain_area = (float(one.mask.sum()) for one in (window, plain))
+        assert area / focal**2 == pytest.approx(plain_area / plain_focal**2, rel=1e-3)
+        assert float((window.image * window.mask[..., None]).mean((0, 1)).norm()) > 0
+    assert best_scale(large) == pytest.approx(1.0, abs=0.021)
+    assert error(large, 1.1) == pytest.approx(error(terms, 1.1), rel=0.1)

@@ -83,6 +83,7 @@ def ensure_gaussians(run: RunFolder, config: Config, scene: Scene, progress: Pro
             progress=logged(progress, run.log),
         )
         dynamic.save(run.path)
+    scene.release_pictures()
     return dynamic
 
 
@@ -104,6 +105,7 @@ def ensure_trajectory(run: RunFolder, config: Config, scene: Scene, progress: Pr
             progress=logged(progress, run.log),
         )
         trajectory.save(run.trajectory)
+    scene.release_pictures()
     return trajectory
 
 
@@ -129,6 +131,7 @@ def ensure_twin(run: RunFolder, config: Config, scene: Scene, progress: Progress
         )
         (run.path / MATERIAL).unlink(missing_ok=True)  # of an earlier twin
         twin.save(run.path)
+    scene.release_pictures()
     return twin
 
 

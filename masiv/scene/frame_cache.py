@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-MAX_BYTES = 1 << 30
+MAX_BYTES = 1 << 29
 """Of the frames that one scene keeps [bytes]."""
+MAX_BYTES_OF_WORKER = 1 << 27
+"""In another process, which is given a scene to compare a few pictures with rollouts [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,12 @@ class FrameCache:
                 _, oldest = self._frames.popitem(last=False)
                 self._bytes -= oldest.nbytes
 
+    def clear(self) -> None:
+        """Keep no frame."""
+        with self._lock:
+            self._frames.clear()
+            self._bytes = 0
+
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled without its frames: another process reads those that it needs."""
-        return FrameCache, (self.load, self.max_bytes)
+        """Pickled without its frames: another process reads those that it needs, and keeps fewer."""
+        return FrameCache, (self.load, min(self.max_bytes, MAX_BYTES_OF_WORKER))

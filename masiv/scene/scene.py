@@ -126,6 +126,12 @@ class Scene:
             raise InputError(f"view {view}, frame {frame} of {self.path} is held out from this stage or does not exist")
         return self.load(view, frame) if self.correct_masks is None else self._corrected(view, frame)
 
+    def release_pictures(self) -> None:
+        """Free the memory of the pictures that were read; those that are needed again are read again."""
+        for cache in (self.load, self.__dict__.get("_corrected")):
+            if isinstance(cache, FrameCache):
+                cache.clear()
+
     def map_views(self, frame: int, function: Callable[[int, Frame], T]) -> list[T]:
         """``function(view, picture)`` of each view of ``frame`` that is not held out, in a thread a core."""
         if self.correct_masks is not None and self.views:

@@ -52,7 +52,7 @@ class ImageTerms:
         def relative_excess(size: float) -> float:
             total = 0.0
             for view in self.problem.scene.views:
-                window = picture_window(self.problem.scene, view, 0)
+                window = picture_window(self.problem, view, 0)
                 difference, area = _alpha_difference(render_particles(window, points, size * spacing, nothing), window)
                 total += float(difference.sum()) / area
             return total
@@ -104,7 +104,7 @@ class ImageTerms:
         problem, colors = self.problem, self.colors
         nothing = torch.zeros(problem.count, 3)
         for frame, view in pictures:
-            window = picture_window(problem.scene, view, frame)
+            window = picture_window(problem, view, frame)
             points = to_world(problem, positions[frame * problem.samples - 1])
             difference, area = _alpha_difference(render_particles(window, points, self.splat_sigma, nothing), window)
             yield (

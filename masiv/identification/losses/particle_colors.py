@@ -57,7 +57,7 @@ def estimate_particle_colors(problem: FilmedBody) -> ParticleColors:
     """
     count, sigma = problem.count, COLOR_SPLAT_SIGMA * particle_spacing(problem)
     points = to_world(problem, problem.particles)
-    windows = [picture_window(problem.scene, view, 0) for view in problem.scene.views]
+    windows = [picture_window(problem, view, 0) for view in problem.scene.views]
     colors = torch.full((count, 3), 0.5, requires_grad=True)
     weight = torch.zeros(count)
     for sweep in range(SIRT_SWEEPS):

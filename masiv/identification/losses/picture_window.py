@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 
 from masiv.models.filmed_body import FilmedBody
 from masiv.scene.camera import Camera
-from masiv.scene.scene import Scene
 from masiv.splat.rasteriser import Rendering, render
 
 MARGIN_PIXELS = 6
 """Width of the border around the bounding box of the mask."""
 PARTICLE_OPACITY = 0.9
+PIXELS_A_PARTICLE = 4
+"""Pixels along the spacing of the particles that silhouettes and colors of particles are compared with, at most: the
+standard deviation of a particle's Gaussian is a tenth of the spacing or more. Chosen, as ``PIXELS_A_VOXEL``."""
 
 
 @dataclass(frozen=True)
@@ -31,18 +35,43 @@ class PictureWindow:
     valid: torch.Tensor
 
 
-def picture_window(scene: Scene, view: int, frame: int) -> PictureWindow:
-    """The window of a picture of ``scene``; the whole picture if its mask is empty."""
-    picture, camera = scene.frame(view, frame), scene.cameras[view]
+def picture_window(problem: FilmedBody, view: int, frame: int) -> PictureWindow:
+    """The window of a picture of the scene of ``problem``; the whole picture if its mask is empty.
+
+    A picture with many more pixels than the particles resolve (``PIXELS_A_PARTICLE``) is averaged down.
+    """
+    picture, camera = problem.scene.frame(view, frame), problem.scene.cameras[view]
     rows, columns = np.nonzero(picture.mask > 0.5)
     crop = slice(None), slice(None)
+    factor = _reduction(problem, camera)
     if len(rows) > 0:
-        y0, y1 = max(rows.min() - MARGIN_PIXELS, 0), min(rows.max() + MARGIN_PIXELS + 1, camera.height)
-        x0, x1 = max(columns.min() - MARGIN_PIXELS, 0), min(columns.max() + MARGIN_PIXELS + 1, camera.width)
+        margin = MARGIN_PIXELS * factor
+        y0, y1 = max(rows.min() - margin, 0), min(rows.max() + margin + 1, camera.height)
+        x0, x1 = max(columns.min() - margin, 0), min(columns.max() + margin + 1, camera.width)
         crop = slice(y0, y1), slice(x0, x1)
         camera = camera.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))
-    image = torch.as_tensor(picture.image[crop].astype(np.float32) / 255)
-    return PictureWindow(camera, image, torch.as_tensor(picture.mask[crop]), torch.as_tensor(picture.valid[crop]))
+    image, mask, valid = picture.image[crop], picture.mask[crop], picture.valid[crop]
+    factor = min(factor, *mask.shape)
+    if factor > 1:
+        camera = camera.reduced(factor)
+        size = camera.width, camera.height
+        whole = slice(0, size[1] * factor), slice(0, size[0] * factor)
+        image, mask, valid = (
+            cv2.resize(part[whole].astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            for part in (image, mask, valid)
+        )
+        valid = valid > 1 - 1e-4
+    pixels = torch.as_tensor(image.astype(np.float32) / 255)
+    return PictureWindow(camera, pixels, torch.as_tensor(mask), torch.as_tensor(valid))
+
+
+def _reduction(problem: FilmedBody, camera: Camera) -> int:
+    """Side of the blocks of pixels that are averaged: a particle of the body at rest is ``PIXELS_A_PARTICLE`` of them
+    wide, or fewer if the picture has no more."""
+    centre = to_world(problem, problem.particles.mean(0, keepdim=True)).double().numpy()
+    depth = float(camera.project(centre)[1][0])
+    focal = math.sqrt(camera.intrinsics[0, 0] * camera.intrinsics[1, 1])
+    return max(1, int(focal * particle_spacing(problem) / (max(depth, 1e-9) * PIXELS_A_PARTICLE)))
 
 
 def render_particles(

@@ -46,15 +46,17 @@ def fit_neural_law(
     """
     config = recordings[0].objective.config
     saved = checkpoint.load() or {}
-    with workers_for(config.processes, config.scheduler, "identify.processes") as workers:
-        if "starts" in saved:
-            starts = [StartingLaw.from_state(state) for state in saved["starts"]]
-        else:
+    if "starts" in saved:
+        starts = [StartingLaw.from_state(state) for state in saved["starts"]]
+    else:
+        with workers_for(config.processes, config.scheduler, "identify.processes") as workers:
             workers.start()
             starts = _starts_to_fit(choose_starting_laws(coarse(), recordings[0].initial_state, progress, workers))
-        nested = NestedCheckpoint(checkpoint, {"starts": [start.state() for start in starts]})
-        if "starts" not in saved:
-            nested.save({})
+    nested = NestedCheckpoint(checkpoint, {"starts": [start.state() for start in starts]})
+    if "starts" not in saved:
+        nested.save({})
+    # New processes: those of the search would keep the states of its rollouts.
+    with workers_for(config.processes, config.scheduler, "identify.processes") as workers:
         fits = _fit_in_parallel(recordings, starts, seed, nested, progress, workers)
     succeeded = [
         _fit_from_state(start, fit) for start, fit in zip(starts, fits, strict=True) if not isinstance(fit, TaskError)

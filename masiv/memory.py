@@ -1,0 +1,73 @@
+"""Memory that a stage took. Light: no torch, no taichi."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+
+import psutil
+
+INTERVAL_S = 0.5
+"""Between two samples of the memory that a stage takes."""
+GROWTH = 1.01
+"""Resident memory that is this many times larger than any before is a new peak."""
+
+
+def taken_bytes() -> float:
+    """Memory [bytes] of this process and of those that it started: what each has for itself, and once what they share.
+
+    Libraries that two processes map are in memory once, so the sum of their resident sets would count them twice.
+    """
+    return _taken(_processes())
+
+
+def _processes() -> list[psutil.Process]:
+    own = psutil.Process()
+    return [own, *own.children(recursive=True)]
+
+
+def _taken(processes: list[psutil.Process]) -> float:
+    private, shared = 0.0, 0.0
+    for process in processes:
+        with suppress(psutil.Error):  # it has ended
+            found = process.memory_full_info()
+            private += found.uss
+            shared = max(shared, found.rss - found.uss)
+    return private + shared
+
+
+def _resident(processes: list[psutil.Process]) -> float:
+    total = 0.0
+    for process in processes:
+        with suppress(psutil.Error):
+            total += process.memory_info().rss
+    return total
+
+
+class PeakMemory:
+    """The largest ``taken_bytes`` while this context is entered, sampled by a thread; ``bytes`` after it."""
+
+    def __init__(self, interval: float = INTERVAL_S) -> None:
+        self.bytes = 0.0
+        self._interval = interval
+        self._left = threading.Event()
+        self._thread = threading.Thread(target=self._sample, name="masiv-memory", daemon=True)
+
+    def __enter__(self) -> PeakMemory:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._left.set()
+        self._thread.join()
+
+    def _sample(self) -> None:
+        resident = 0.0
+        while True:
+            processes = _processes()
+            now = _resident(processes)
+            if now > GROWTH * resident:  # what is shared takes the system longer to count
+                resident = now
+                self.bytes = max(self.bytes, _taken(processes))
+            if self._left.wait(self._interval):
+                return
