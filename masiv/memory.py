@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+import time
 from contextlib import suppress
 
 import psutil
 
 INTERVAL_S = 0.5
 """Between two samples of the memory that a stage takes."""
+MAX_SHARE = 0.02
+"""Of the time of a core that samples may take, at most."""
 GROWTH = 1.01
 """Resident memory that is this many times larger than any before is a new peak."""
 
@@ -64,10 +67,12 @@ class PeakMemory:
     def _sample(self) -> None:
         resident = 0.0
         while True:
+            began = time.perf_counter()
             processes = _processes()
             now = _resident(processes)
             if now > GROWTH * resident:  # what is shared takes the system longer to count
                 resident = now
                 self.bytes = max(self.bytes, _taken(processes))
-            if self._left.wait(self._interval):
+            cost = time.perf_counter() - began  # grows with the processes of the machine
+            if self._left.wait(max(self._interval, cost / MAX_SHARE)):
                 return
