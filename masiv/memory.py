@@ -1,10 +1,12 @@
-"""Memory that a stage took. Light: no torch, no taichi."""
+"""Memory that a stage took, and that there is. Light: no torch, no taichi."""
 
 from __future__ import annotations
 
+import ctypes
 import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import psutil
 
@@ -12,6 +14,7 @@ INTERVAL_S = 0.5
 """Between two samples of the memory that a stage takes."""
 MAX_SHARE = 0.02
 """Of the time of a core that samples may take, at most."""
+CONTROL_GROUPS = Path("/sys/fs/cgroup")
 GROWTH = 1.01
 """Resident memory that is this many times larger than any before is a new peak."""
 
@@ -22,6 +25,33 @@ def taken_bytes() -> float:
     Libraries that two processes map are in memory once, so the sum of their resident sets would count them twice.
     """
     return _taken(_processes())
+
+
+def available_bytes(control_groups: Path = CONTROL_GROUPS) -> float:
+    """Memory [bytes] that this machine still has, or the container that this process runs in, if that has less.
+
+    control_groups: where Linux mounts the limits of containers (cgroup v2, or v1 with its controller ``memory``).
+    """
+    left = float(psutil.virtual_memory().available)
+    for maximum, used, cache in (
+        ("memory.max", "memory.current", "inactive_file"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
+    ):
+        with suppress(OSError, ValueError, KeyError):  # no such file, or "max": no limit
+            limit = int((control_groups / maximum).read_text())
+            statistics = (control_groups / maximum).with_name("memory.stat").read_text()
+            taken_back = int(dict(line.split() for line in statistics.splitlines())[cache])
+            left = min(left, limit - int((control_groups / used).read_text()) + taken_back)
+    return max(left, 0.0)
+
+
+def return_freed() -> None:
+    """Give memory that this process has freed back to the system, which the C library would keep for its next use.
+
+    Of glibc (``malloc_trim``); other C libraries do so themselves, or cannot be asked.
+    """
+    with suppress(AttributeError, OSError, TypeError):  # TypeError: Windows has no library of the process itself
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _processes() -> list[psutil.Process]:

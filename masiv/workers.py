@@ -69,10 +69,10 @@ class Workers:
     """A pool of ``processes`` that run tasks; with 1, tasks run in this process. With a ``dask_pool`` they are the
     workers of a cluster, and all tasks run there.
 
-    Use as a context. The processes start with the first task. If the block raises, they are terminated at once, and if
-    this process is killed, they end, too; Ctrl-C reaches this process alone. key: of the configuration, that sets their
-    number, for messages. A script that uses more than one process needs ``if __name__ == "__main__":``, as always with
-    ``multiprocessing``.
+    Use as a context. A process starts with a task that no idle one can take. If the block raises, they are terminated
+    at once, and if this process is killed, they end, too; Ctrl-C reaches this process alone. key: of the configuration,
+    that sets their number, for messages. A script that uses more than one process needs
+    ``if __name__ == "__main__":``, as always with ``multiprocessing``.
     """
 
     def __init__(self, processes: int = 1, key: str = "refine.processes", dask_pool: DaskPool | None = None) -> None:
@@ -101,9 +101,10 @@ class Workers:
         self._pool = None
 
     def start(self) -> None:
-        """Start the processes, if there are several, and return at once: they need seconds until the first task."""
+        """Start all processes, if there are several, and return at once: they need seconds until the first task."""
         if self.processes > 1 and self._dask is None:
-            self._running()
+            for _ in range(self.processes):
+                self._submit_here(_do_nothing)
 
     def map(self, function: Callable, tasks: Iterable[tuple], *, shared: tuple = ()) -> Iterator[Any]:
         """``function(*shared, *task)`` of each task, in order, or ``TaskError``.
@@ -148,8 +149,10 @@ class Workers:
 
     def _submit(self, function: Callable, task: tuple, shared: Any) -> Future[bytes]:
         """shared: where the pickled arguments are that come first."""
-        pool = self._dask or self._running()
-        return pool.submit(_run_pickled_task, pickle.dumps((function, task)), shared)
+        arguments = pickle.dumps((function, task)), shared
+        if self._dask is not None:
+            return self._dask.submit(_run_pickled_task, *arguments)
+        return self._submit_here(_run_pickled_task, *arguments)
 
     def _result(self, future: Future[bytes]) -> Any:
         try:
@@ -157,19 +160,18 @@ class Workers:
         except BrokenProcessPool as died:
             raise MasivError(f"a worker process died, perhaps for lack of memory: set {self.key} to 1") from died
 
-    def _running(self) -> ProcessPoolExecutor:
+    def _submit_here(self, function: Callable, *arguments: Any) -> Future:
+        """Run ``function(*arguments)`` in a process of this machine: a new one if none is idle and more may start."""
         if self._pool is None:
-            others = set(multiprocessing.active_children())
             spawn = multiprocessing.get_context("spawn")  # Taichi's threads do not survive a fork
-            arguments = (runtime.running_arch(), os.getpid())
-            self._pool = ProcessPoolExecutor(self.processes, spawn, initialize_process, arguments)
-            try:
-                with interrupts_not_inherited():
-                    for _ in range(self.processes):  # a pool starts a process for each task that no idle one can take
-                        self._pool.submit(_do_nothing)
-            finally:  # an interruption, too, has to find those that have started
-                self._started = set(multiprocessing.active_children()) - others
-        return self._pool
+            start = (runtime.running_arch(), os.getpid())
+            self._pool = ProcessPoolExecutor(self.processes, spawn, initialize_process, start)
+        others = set(multiprocessing.active_children()) - self._started
+        try:
+            with interrupts_not_inherited():
+                return self._pool.submit(function, *arguments)
+        finally:  # an interruption, too, has to find those that have started
+            self._started = set(multiprocessing.active_children()) - others
 
 
 @contextmanager

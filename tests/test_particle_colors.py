@@ -83,7 +83,7 @@ def test_the_derivative_equals_finite_differences(terms):
     behind, step = TURN - np.deg2rad(5), np.deg2rad(0.5)
     points = to_world(problem, problem.particles).double().numpy()
     now = torch.as_tensor(turned(points, behind), dtype=torch.float32).requires_grad_()
-    window = picture_window(problem.scene, 2, 1)
+    window = picture_window(problem, 2, 1)
     color_correlation_loss(terms.colors, now, window).backward()
     around = torch.as_tensor(np.cross([0.0, 1.0, 0.0], turned(points, behind) - CENTRE), dtype=torch.float32)
     there = [torch.as_tensor(turned(points, behind + s), dtype=torch.float32) for s in (step, -step)]

@@ -78,6 +78,7 @@ def fine_tune(
     Raises MasivError if the loss becomes non-finite.
     """
     loss = _TrajectoryLoss(scene, dynamic, start, config, known)
+    scene.release_pictures()  # the loss keeps the masks in a file
     weights = loss_weights(config)
     network = copy.deepcopy(dynamic.deformation if known is None else known.network).requires_grad_(True)
     optimiser = torch.optim.Adam(network.parameters(), lr=config.learning_rate)

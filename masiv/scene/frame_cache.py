@@ -10,10 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from masiv.memory import return_freed
+
 MAX_BYTES = 1 << 29
 """Of the frames that one scene keeps [bytes]."""
 MAX_BYTES_OF_WORKER = 1 << 27
 """In another process, which is given a scene to compare a few pictures with rollouts [bytes]."""
+
+RETURNED_SHARE = 0.25
+"""Memory of dropped frames goes back to the system when it is this share of what is kept: arrays of other sizes leave
+gaps between them, which would add up to as much as is kept."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class FrameCache:
         self.load = load
         self.max_bytes = max_bytes
         self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
-        self._bytes = 0
+        self._bytes, self._dropped = 0, 0
         self._lock = threading.Lock()
 
     def __call__(self, view: int, frame: int) -> Frame:
@@ -68,6 +74,10 @@ class FrameCache:
             while self._bytes > self.max_bytes and len(self._frames) > 1:
                 _, oldest = self._frames.popitem(last=False)
                 self._bytes -= oldest.nbytes
+                self._dropped += oldest.nbytes
+            if self._dropped > self.max_bytes * RETURNED_SHARE:
+                self._dropped = 0
+                return_freed()
 
     def clear(self) -> None:
         """Keep no frame."""

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from masiv.errors import InputError
+from masiv.memory import return_freed
 from masiv.scene.camera import Camera
 from masiv.scene.cloud import Cloud
 from masiv.scene.depth import DepthNoise
@@ -131,6 +132,7 @@ class Scene:
         for cache in (self.load, self.__dict__.get("_corrected")):
             if isinstance(cache, FrameCache):
                 cache.clear()
+        return_freed()
 
     def map_views(self, frame: int, function: Callable[[int, Frame], T]) -> list[T]:
         """``function(view, picture)`` of each view of ``frame`` that is not held out, in a thread a core."""

@@ -135,6 +135,7 @@ class _Fit:
             self.images,
             scene.view_time_offsets,
         )
+        scene.release_pictures()  # the images keep the object in a file
         return initial
 
     def _begin(self, initial: InitialGaussians) -> None:
