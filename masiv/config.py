@@ -53,13 +53,18 @@ DEFAULT_PRESET = "standard"
 
 
 class Config(BaseModel):
-    """What a run is asked to do. ``arch`` is where kernels run and ``processes`` in how many processes; every other
-    key may change the numbers."""
+    """What a run is asked to do. ``arch`` is where kernels run, ``processes`` in how many processes, and
+    ``memory_limit_mb`` whether a stage starts; every other key may change the numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     preset: Preset = Field(DEFAULT_PRESET, description="the settings that all others start from")
     seed: int = Field(0, ge=0, lt=2**31, description="seed of every random number")
     arch: Literal["cpu", "cuda", "vulkan"] = Field("cpu", description="where Taichi runs its kernels")
+    memory_limit_mb: int = Field(
+        0, ge=0, lt=2**31,
+        description="memory that a stage may take [MB]: one that is expected to take more does not start; 0: what the "
+        "machine has left",
+    )  # fmt: skip
     reconstruct: ReconstructConfig = ReconstructConfig.model_validate({})
     trajectory: TrajectoryConfig = TrajectoryConfig.model_validate({})
     simulator: SimulatorConfig = SimulatorConfig.model_validate({})

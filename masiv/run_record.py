@@ -21,13 +21,14 @@ class _Part(BaseModel):
 
 class StagePart(_Part):
     """state: what is left of the stage; seconds [s]: for how long it ran; started, finished: when; peak_memory_mb [MB]:
-    what it took, with its processes."""
+    what it took, with its processes; expected_memory_mb [MB]: what was said before it ran."""
 
     state: Literal["pending", "running", "done"]
     started: Any = None
     finished: Any = None
     seconds: Annotated[float, Field(ge=0)] = 0.0
     peak_memory_mb: Count = 0
+    expected_memory_mb: Count = 0
 
 
 class StagesPart(_Part):

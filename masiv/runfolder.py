@@ -199,12 +199,14 @@ class RunFolder:
         return Checkpoint(self.path / "checkpoints" / f"{stage}.pt")
 
     @contextmanager
-    def stage(self, stage: str) -> Iterator[Checkpoint]:
+    def stage(self, stage: str, expected_mb: float = 0) -> Iterator[Checkpoint]:
         """Record that ``stage`` runs, and on leaving without an error that it is done; for how long it ran and the
-        memory that it took with its processes."""
+        memory that it took with its processes. expected_mb [MB]: that it was expected to take; 0: it was not said."""
         state = self.record["stages"][stage]
         state["state"] = RUNNING
         state.setdefault("started", _now())
+        if expected_mb:
+            state["expected_memory_mb"] = round(expected_mb)
         self._write()
         began = time.monotonic()
         checkpoint = self.checkpoint(stage)

@@ -112,8 +112,7 @@ class Simulator:
         """Those of MLS-MPM for the body's capacity, made if a rollout needs them."""
         real, size = ("f64", 8) if self.dtype == torch.float64 else ("f32", 4)
         particles = _round_up(self.count, PARTICLES_UNIT)
-        affordable = max(8, self._memory_mb * 1_000_000 // (size * floats_a_substep(particles)))
-        steps = min(_round_up(self._max_substeps, SUBSTEPS_UNIT), 1 << int(math.log2(affordable)))
+        steps = _kept_substeps(particles, self._memory_mb, self._max_substeps, size)
         return _shared_kernels(real, steps, particles, self._grid_nodes, self._chunks)
 
     def run(
@@ -149,6 +148,20 @@ class Simulator:
             rollout = TapedRollout(self.kernels, self.constants, self.mass, law, steps, outputs, effects, time)
         rollout.forward(initial)
         return rollout
+
+
+def kernels_bytes(particles: int, memory_mb: int, max_substeps: int, grid_nodes: int, chunks: int) -> int:
+    """Memory [bytes] that a process reserves for float32 simulators of one capacity (``Simulator``): the states and the
+    log of grids that are kept, and the grids: (momentum, mass) of each chunk, velocities, and the adjoints of both."""
+    particles = _round_up(particles, PARTICLES_UNIT)
+    states = _kept_substeps(particles, memory_mb, max_substeps, 4) * floats_a_substep(particles)
+    return 4 * (states + (4 * chunks + 11) * grid_nodes)
+
+
+def _kept_substeps(particles: int, memory_mb: int, max_substeps: int, size: int) -> int:
+    """How many substeps are kept at once of ``particles``, a number that was rounded up. size: of a number [bytes]."""
+    affordable = max(8, memory_mb * 1_000_000 // (size * floats_a_substep(particles)))
+    return min(_round_up(max_substeps, SUBSTEPS_UNIT), 1 << int(math.log2(affordable)))
 
 
 def floats_a_substep(particles: int) -> int:

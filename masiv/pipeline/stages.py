@@ -15,10 +15,11 @@ from masiv.errors import InputError
 from masiv.hull.first_frame import require_first_frame
 from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
+from masiv.pipeline.expected_memory import expected_memory
 from masiv.progress import Progress, silent
 from masiv.report.history import logged
 from masiv.report.sections.material import MATERIAL, read_material
-from masiv.runfolder import RunFolder, load_motion
+from masiv.runfolder import STAGES, RunFolder, load_motion
 from masiv.scene.calibration import Calibration
 from masiv.scene.listing import mapping
 from masiv.scene.scene import Scene
@@ -74,7 +75,7 @@ def ensure_gaussians(run: RunFolder, config: Config, scene: Scene, progress: Pro
 
     if scene.masks_estimated:
         require_first_frame(training_scene(run, scene))
-    with run.stage("reconstruct") as checkpoint:
+    with run.stage("reconstruct", _say_memory(run, "reconstruct", config, scene, progress)) as checkpoint:
         dynamic = reconstruct(
             training_scene(run, scene),
             config.reconstruct,
@@ -95,7 +96,7 @@ def ensure_trajectory(run: RunFolder, config: Config, scene: Scene, progress: Pr
     from masiv.continuum.trajectory import estimate_trajectory
 
     dynamic = ensure_gaussians(run, config, scene, progress)
-    with run.stage("trajectory") as checkpoint:
+    with run.stage("trajectory", _say_memory(run, "trajectory", config, scene, progress)) as checkpoint:
         trajectory = estimate_trajectory(
             training_scene(run, scene),
             dynamic,
@@ -118,7 +119,9 @@ def ensure_twin(run: RunFolder, config: Config, scene: Scene, progress: Progress
     if run.done("identify"):
         return Twin.load(run.path)
     trajectory = ensure_trajectory(run, config, scene, progress)
-    with run.stage("identify") as checkpoint:
+    particles = trajectory.positions.shape[1]
+    expected = _say_memory(run, "identify", config, scene, progress, particles)
+    with run.stage("identify", expected) as checkpoint:
         twin = identify(
             training_scene(run, scene),
             trajectory,
@@ -133,6 +136,25 @@ def ensure_twin(run: RunFolder, config: Config, scene: Scene, progress: Progress
         twin.save(run.path)
     scene.release_pictures()
     return twin
+
+
+def require_memory(run: RunFolder, config: Config, scene: Scene, last: str) -> None:
+    """Raises InputError if a stage that is missing, up to ``last``, would not fit into memory."""
+    visible = scene.restricted(run.fit_frames, run.holdout_cameras)
+    for stage in STAGES[: STAGES.index(last) + 1]:
+        if not run.done(stage):
+            expected_memory(stage, visible, config).require(config.memory_limit_mb)
+
+
+def _say_memory(
+    run: RunFolder, stage: str, config: Config, scene: Scene, progress: Progress, particles: int | None = None
+) -> float:
+    """Say how much memory the stage is expected to take [MB]. Raises InputError if that is too much."""
+    visible = scene.restricted(run.fit_frames, run.holdout_cameras)
+    expected = expected_memory(stage, visible, config, particles)
+    expected.require(config.memory_limit_mb)
+    progress(stage, 0, 1, expected.text())
+    return expected.mb
 
 
 def other_recordings(config: Config) -> list[tuple[Scene, Trajectory]]:

@@ -108,6 +108,8 @@ class VideoRun(Run):
         return Summary(data, f"{text}{table({'reconstruction': numbers})}")
 
     def trajectory(self, progress: Progress = silent) -> Summary:
+        self.start()
+        stages.require_memory(self.folder, self.config, self._given_scene(), "trajectory")
         with self.changing():
             made = stages.ensure_trajectory(self.folder, self.config, self.scene, progress)
         frames, particles = made.positions.shape[:2]
@@ -140,6 +142,7 @@ class VideoRun(Run):
         from masiv.simulation.simulate import simulate
 
         folder = self.folder
+        stages.require_memory(folder, self.config, self._given_scene(), "identify")
         dynamic = stages.ensure_gaussians(folder, self.config, self.scene, progress)
         scene = self.scene
         trajectory = stages.ensure_trajectory(folder, self.config, scene, progress)

@@ -1,0 +1,136 @@
+"""Memory that a stage will take at its peak, said before it starts. Sizes of arrays follow from the settings; what
+processes, libraries and the rest take was measured (benchmarks/memory.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from masiv.config import Config
+from masiv.errors import InputError
+from masiv.identification.config import IdentifyConfig
+from masiv.memory import available_bytes, taken_bytes
+from masiv.mpm.config import SimulatorConfig
+from masiv.mpm.simulator import kernels_bytes
+from masiv.scene.frame_cache import MAX_BYTES
+from masiv.scene.scene import Scene
+from masiv.workers import process_count
+
+MAIN_MB = {"reconstruct": 530, "trajectory": 600, "identify": 600}
+"""The first process with its libraries and kernels [MB]."""
+GRADIENT_PROCESS_MB = 230
+"""The second process of reconstruct [MB]."""
+SEARCH_PROCESS_MB = 180
+"""A further process of identify, without what its simulator reserves [MB]."""
+FIT_PROCESS_MB = 290
+"""The one that fits a second starting law, without what its simulator reserves [MB]."""
+BYTES_A_PIXEL, BYTES_A_DEPTH = 8, 4
+"""Of a picture with its mask, and of its depth."""
+BYTES_READ_A_PIXEL = 150
+"""That reading pictures takes beside those that are kept, for each pixel of one picture."""
+
+
+@dataclass(frozen=True)
+class MemoryPart:
+    """What takes memory: how much [MB], and the setting that makes it less."""
+
+    name: str
+    mb: float
+    less_with: str
+
+
+@dataclass(frozen=True)
+class ExpectedMemory:
+    """The peak of a stage with its processes, by part. A second starting law is counted, which identify may not fit."""
+
+    stage: str
+    parts: tuple[MemoryPart, ...]
+
+    @property
+    def mb(self) -> float:
+        """The whole [MB]."""
+        return sum(part.mb for part in self.parts)
+
+    def text(self) -> str:
+        """In words, the largest part first."""
+        parts = sorted(self.parts, key=lambda part: -part.mb)
+        return f"about {_gb(self.mb)} of memory: " + ", ".join(f"{part.name} {_gb(part.mb)}" for part in parts)
+
+    def require(self, limit_mb: float, available_mb: Callable[[], float] | None = None) -> None:
+        """Raises InputError if the stage would not fit. limit_mb: what it may take, 0: what the machine has left and
+        this process has already. available_mb: says how much that is; None: asks the system."""
+        allowed = limit_mb or (available_mb or _available_mb)()
+        if self.mb <= allowed:
+            return
+        reason = "memory_limit_mb allows" if limit_mb else "the machine has left"
+        large = [part for part in self.parts if part.less_with and part.mb > 0.05 * self.mb]
+        helpful = sorted(large or self.parts, key=lambda part: -part.mb)
+        less = "; ".join(f"{part.less_with} (now {_gb(part.mb)})" for part in helpful)
+        raise InputError(
+            f"{self.stage} would take {self.text()}; {reason} {_gb(allowed)}. To take less: {less}. To start it all "
+            f"the same: memory_limit_mb={round(self.mb / 100 + 1) * 100}"
+        )
+
+
+def expected_memory(stage: str, scene: Scene, config: Config, particles: int | None = None) -> ExpectedMemory:
+    """Of "reconstruct", "trajectory" or "identify" of pictures or clouds. scene: what the stage sees. particles: of the
+    trajectory, if it is known."""
+    count = particles or config.trajectory.particle_count
+    parts = {"reconstruct": _reconstruct, "trajectory": _trajectory, "identify": _identify}[stage]
+    return ExpectedMemory(stage, (MemoryPart("the process", MAIN_MB[stage], ""), *parts(scene, config, count)))
+
+
+def _reconstruct(scene: Scene, config: Config, _count: int) -> Sequence[MemoryPart]:
+    several = config.reconstruct.batch_size > 1 and process_count(config.reconstruct.processes) > 1
+    second = [MemoryPart("a second process", GRADIENT_PROCESS_MB, "reconstruct.processes=1")] if several else []
+    return [*second, _pictures(scene)]
+
+
+def _trajectory(scene: Scene, config: Config, count: int) -> Sequence[MemoryPart]:
+    return [_pictures(scene)]
+
+
+def _pictures(scene: Scene) -> MemoryPart:
+    """Those that are kept, and what reading takes."""
+    if scene.load_cloud is not None:
+        return MemoryPart("point clouds", 0.0, "")
+    pixels = [scene.cameras[view].width * scene.cameras[view].height for view in scene.views]
+    a_pixel = BYTES_A_PIXEL + (BYTES_A_DEPTH if scene.depth_noise is not None else 0)
+    kept = min(MAX_BYTES, a_pixel * scene.frame_count * sum(pixels))
+    return MemoryPart("pictures", (kept + BYTES_READ_A_PIXEL * max(pixels)) / 1e6, "smaller pictures")
+
+
+def _identify(_scene: Scene, config: Config, count: int) -> Sequence[MemoryPart]:
+    identify, simulator = config.identify, config.simulator
+    search = _capacity_mb(min(count, identify.search_particles), simulator)
+    whole = _capacity_mb(count, simulator)
+    processes = 1 if identify.scheduler else process_count(identify.processes)
+    states, others = max(_states(identify, processes, search, whole), key=sum)
+    parts = [MemoryPart("states for the adjoint", states, "a lower simulator.memory_mb")]
+    return [*parts, MemoryPart("further processes", others, "identify.processes=1")] if others else parts
+
+
+def _states(identify: IdentifyConfig, processes: int, search: float, whole: float) -> list[tuple[float, float]]:
+    """Of the search for laws with few particles and of the fits with all: what simulators reserve, and what processes
+    beside the first take without that [MB]. search, whole: a simulator of few particles, and of all."""
+    both = whole if whole == search else whole + search  # one process keeps both: Taichi frees nothing
+    if identify.law == "neural":
+        if identify.scheduler:
+            return [(whole, 0.0)]
+        if processes > 1:
+            return [(processes * search, processes * SEARCH_PROCESS_MB), (2 * whole, FIT_PROCESS_MB)]
+    if identify.law == "auto" and processes > 1:
+        return [((processes + 1) * search, processes * SEARCH_PROCESS_MB), (both, 0.0)]
+    return [(both, 0.0)]
+
+
+def _capacity_mb(particles: int, simulator: SimulatorConfig) -> float:
+    return kernels_bytes(particles, simulator.memory_mb, 1024, simulator.grid_nodes, simulator.chunks) / 1e6
+
+
+def _available_mb() -> float:
+    return (available_bytes() + taken_bytes()) / 1e6
+
+
+def _gb(mb: float) -> str:
+    return f"{mb / 1000:.1f} GB"
