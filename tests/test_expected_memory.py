@@ -13,8 +13,6 @@ from masiv.memory import available_bytes
 from masiv.mpm.simulator import kernels_bytes
 from masiv.pipeline.expected_memory import expected_memory
 
-STAGES = ("reconstruct", "trajectory", "identify")
-
 
 def config(*assignments):
     return load_config("quick", assignments=("reconstruct.processes=1", "identify.processes=2", *assignments))
@@ -34,6 +32,10 @@ def expected(stage, *assignments, scene=None, particles=None):
 )
 def test_a_setting_that_takes_more_is_expected_to(stage, more):
     assert expected(stage, more) > expected(stage) + 50
+
+
+def test_refine_takes_less_in_one_process():
+    assert expected("refine", "refine.processes=1") < expected("refine", "refine.processes=2") - 500
 
 
 @pytest.mark.parametrize("less", ["identify.processes=1", "simulator.memory_mb=300", "identify.law=neo_hookean"])

@@ -3,7 +3,7 @@ processes, libraries and the rest take was measured (benchmarks/memory.py)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from masiv.config import Config
@@ -16,7 +16,7 @@ from masiv.scene.frame_cache import MAX_BYTES
 from masiv.scene.scene import Scene
 from masiv.workers import process_count
 
-MAIN_MB = {"reconstruct": 530, "trajectory": 600, "identify": 600}
+MAIN_MB = {"reconstruct": 530, "trajectory": 600, "identify": 600, "refine": 550}
 """The first process with its libraries and kernels [MB]."""
 GRADIENT_PROCESS_MB = 230
 """The second process of reconstruct [MB]."""
@@ -24,6 +24,8 @@ SEARCH_PROCESS_MB = 180
 """A further process of identify, without what its simulator reserves [MB]."""
 FIT_PROCESS_MB = 290
 """The one that fits a second starting law, without what its simulator reserves [MB]."""
+REFINE_PROCESS_MB = 340
+"""One that fits effects, without what its simulators reserve [MB]."""
 BYTES_A_PIXEL, BYTES_A_DEPTH = 8, 4
 """Of a picture with its mask, and of its depth."""
 BYTES_READ_A_PIXEL = 150
@@ -73,21 +75,22 @@ class ExpectedMemory:
 
 
 def expected_memory(stage: str, scene: Scene, config: Config, particles: int | None = None) -> ExpectedMemory:
-    """Of "reconstruct", "trajectory" or "identify" of pictures or clouds. scene: what the stage sees. particles: of the
-    trajectory, if it is known."""
+    """Of "reconstruct", "trajectory", "identify" or "refine" of pictures or clouds. scene: what the stage sees.
+    particles: of the trajectory, if it is known."""
     count = particles or config.trajectory.particle_count
-    parts = {"reconstruct": _reconstruct, "trajectory": _trajectory, "identify": _identify}[stage]
-    return ExpectedMemory(stage, (MemoryPart("the process", MAIN_MB[stage], ""), *parts(scene, config, count)))
+    if stage == "reconstruct":
+        parts = [*_second_process(config), _pictures(scene)]
+    elif stage == "trajectory":
+        parts = [_pictures(scene)]
+    else:
+        parts = {"identify": _identify, "refine": _refine}[stage](config, count)
+    return ExpectedMemory(stage, (MemoryPart("the process", MAIN_MB[stage], ""), *parts))
 
 
-def _reconstruct(scene: Scene, config: Config, _count: int) -> Sequence[MemoryPart]:
-    several = config.reconstruct.batch_size > 1 and process_count(config.reconstruct.processes) > 1
-    second = [MemoryPart("a second process", GRADIENT_PROCESS_MB, "reconstruct.processes=1")] if several else []
-    return [*second, _pictures(scene)]
-
-
-def _trajectory(scene: Scene, config: Config, count: int) -> Sequence[MemoryPart]:
-    return [_pictures(scene)]
+def _second_process(config: Config) -> list[MemoryPart]:
+    if config.reconstruct.batch_size == 1 or process_count(config.reconstruct.processes) == 1:
+        return []
+    return [MemoryPart("a second process", GRADIENT_PROCESS_MB, "reconstruct.processes=1")]
 
 
 def _pictures(scene: Scene) -> MemoryPart:
@@ -100,14 +103,29 @@ def _pictures(scene: Scene) -> MemoryPart:
     return MemoryPart("pictures", (kept + BYTES_READ_A_PIXEL * max(pixels)) / 1e6, "smaller pictures")
 
 
-def _identify(_scene: Scene, config: Config, count: int) -> Sequence[MemoryPart]:
+def _identify(config: Config, count: int) -> list[MemoryPart]:
     identify, simulator = config.identify, config.simulator
     search = _capacity_mb(min(count, identify.search_particles), simulator)
     whole = _capacity_mb(count, simulator)
     processes = 1 if identify.scheduler else process_count(identify.processes)
-    states, others = max(_states(identify, processes, search, whole), key=sum)
+    return _simulating(*max(_states(identify, processes, search, whole), key=sum), "identify.processes=1")
+
+
+def _refine(config: Config, count: int) -> list[MemoryPart]:
+    """Candidates are fitted with few particles; those that are left are simulated with all, for discretisation."""
+    refine, simulator = config.refine, config.simulator
+    few, whole = (_capacity_mb(n, simulator) for n in (min(count, refine.particles), count))
+    both = whole if whole == few else whole + few
+    processes = 1 if refine.scheduler else process_count(refine.processes)
+    if processes == 1:
+        return _simulating(few if refine.scheduler else both, 0.0, "")
+    return _simulating(few + processes * both, processes * REFINE_PROCESS_MB, "refine.processes=1")
+
+
+def _simulating(states: float, others: float, less_with: str) -> list[MemoryPart]:
+    """states, others [MB]: what simulators reserve, and what processes beside the first take without that."""
     parts = [MemoryPart("states for the adjoint", states, "a lower simulator.memory_mb")]
-    return [*parts, MemoryPart("further processes", others, "identify.processes=1")] if others else parts
+    return [*parts, MemoryPart("further processes", others, less_with)] if others else parts
 
 
 def _states(identify: IdentifyConfig, processes: int, search: float, whole: float) -> list[tuple[float, float]]:

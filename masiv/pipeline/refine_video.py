@@ -9,6 +9,7 @@ import numpy as np
 
 from masiv.files import write_json
 from masiv.pipeline import stages
+from masiv.pipeline.expected_memory import expected_memory
 from masiv.pipeline.requests import RefineRequest, Summary
 from masiv.progress import Progress
 from masiv.runfolder import RunFolder
@@ -33,6 +34,10 @@ def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Prog
 
     first = runs[0]
     recordings = [recording_of(run, progress) for run in runs]
+    particles = max(r.motion.positions.shape[1] for r in recordings)
+    memory = expected_memory("refine", recordings[0].scene, first.config, particles)
+    memory.require(first.config.memory_limit_mb)
+    progress("refine", 0, 1, memory.text())
     twin = load_identified(first.path)
     checkpoint = first.folder.checkpoint("refine")
     result = refine_recordings(
