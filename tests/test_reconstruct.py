@@ -99,6 +99,50 @@ def result(scene, tmp_path_factory):
     )
 
 
+class States(Checkpoint):
+    """Keeps the base motion after each step."""
+
+    def __init__(self):
+        super().__init__(None)
+        self.base_motions = []
+
+    def maybe_save(self, state):
+        self.base_motions.append(state()["network"]["base_motion"].clone())
+
+
+def test_frames_that_are_not_in_the_fit_yet_keep_the_base_motion_of_their_hulls():
+    scene = dataclasses.replace(filmed(lambda unit, _: 0.2 * unit + np.array([0.0, 0.5, 0.0])), frame_count=30)
+    config = CONFIG.model_copy(update={"iterations": 60, "first_frame_fraction": 0.1, "growth_fraction": 0.8})
+    states = States()
+    reconstruct(scene, config, seed=0, checkpoint=states, progress=silent)
+    first, middle, last = states.base_motions[0], states.base_motions[30], states.base_motions[-1]
+    assert torch.equal(middle[20:], first[20:])
+    assert not torch.equal(middle[:10], first[:10])
+    assert not torch.equal(last[20:], first[20:])
+
+
+def test_adam_moves_the_base_motion_of_frames_without_images_unless_it_is_held():
+    """Between frames, where a clock is late, the spline passes 0.27 of a gradient on from frame to frame, and Adam
+    divides by the size of a gradient."""
+
+    def moved(held):
+        network = DeformationNetwork(
+            centre=torch.zeros(3), half_extent=1.0, frame_count=60, fps=FPS, base_motion=torch.zeros(60, 3)
+        )
+        optimiser, rng = torch.optim.Adam([network.base_motion], lr=1e-3, eps=1e-15), np.random.default_rng(0)
+        for _ in range(400):
+            frame, seen = rng.integers(1, 10), torch.as_tensor(rng.normal(scale=0.01, size=3), dtype=torch.float32)
+            optimiser.zero_grad()
+            (network.base_displacements(torch.tensor([(frame + 0.1) / FPS])) - seen).square().sum().backward()
+            if held:
+                network.hold_base_motion(10)
+            optimiser.step()
+        return float(network.base_motion.detach()[20:].abs().max())
+
+    assert moved(held=True) == 0.0
+    assert moved(held=False) > 2e-3  # more than two steps
+
+
 @pytest.mark.slow
 def test_material_points_are_followed(result):
     unit, _ = ball()

@@ -28,8 +28,8 @@ REFINE_PROCESS_MB = 340
 """One that fits effects, without what its simulators reserve [MB]."""
 BYTES_A_PIXEL, BYTES_A_DEPTH = 8, 4
 """Of a picture with its mask, and of its depth."""
-BYTES_READ_A_PIXEL = 150
-"""That reading pictures takes beside those that are kept, for each pixel of one picture."""
+BYTES_READ_A_PIXEL = {"reconstruct": 5, "trajectory": 28, "identify": 5}
+"""Beside the pictures that are kept, for each pixel of all pictures of one frame: what is made of them together."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,13 @@ def expected_memory(stage: str, scene: Scene, config: Config, particles: int | N
     particles: of the trajectory, if it is known."""
     count = particles or config.trajectory.particle_count
     if stage == "reconstruct":
-        parts = [*_second_process(config), _pictures(scene)]
+        parts = [*_second_process(config), _pictures(stage, scene)]
     elif stage == "trajectory":
-        parts = [_pictures(scene)]
+        parts = [_pictures(stage, scene)]
+    elif stage == "identify":
+        parts = [*_identify(config, count), _pictures(stage, scene)]
     else:
-        parts = {"identify": _identify, "refine": _refine}[stage](config, count)
+        parts = _refine(config, count)
     return ExpectedMemory(stage, (MemoryPart("the process", MAIN_MB[stage], ""), *parts))
 
 
@@ -93,14 +95,13 @@ def _second_process(config: Config) -> list[MemoryPart]:
     return [MemoryPart("a second process", GRADIENT_PROCESS_MB, "reconstruct.processes=1")]
 
 
-def _pictures(scene: Scene) -> MemoryPart:
-    """Those that are kept, and what reading takes."""
+def _pictures(stage: str, scene: Scene) -> MemoryPart:
     if scene.load_cloud is not None:
         return MemoryPart("point clouds", 0.0, "")
     pixels = [scene.cameras[view].width * scene.cameras[view].height for view in scene.views]
     a_pixel = BYTES_A_PIXEL + (BYTES_A_DEPTH if scene.depth_noise is not None else 0)
     kept = min(MAX_BYTES, a_pixel * scene.frame_count * sum(pixels))
-    return MemoryPart("pictures", (kept + BYTES_READ_A_PIXEL * max(pixels)) / 1e6, "smaller pictures")
+    return MemoryPart("pictures", (kept + BYTES_READ_A_PIXEL[stage] * sum(pixels)) / 1e6, "smaller pictures")
 
 
 def _identify(config: Config, count: int) -> list[MemoryPart]:

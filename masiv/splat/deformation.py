@@ -111,6 +111,15 @@ class DeformationNetwork(torch.nn.Module):
         """Displacement (K, 3) [m] of the base motion at ``times`` (K,) [s]."""
         return self._base(times * self.fps) - self.base_motion[0]
 
+    def hold_base_motion(self, first: int) -> None:
+        """Set the gradient of the base motion from frame ``first`` on to zero, so that a step leaves it as it is.
+
+        The spline passes a minute part of the gradient of one frame on to all others, with alternating signs, and Adam
+        makes a step of full length of it. The base motion of frames that no image has moved yet would wander off.
+        """
+        if self.base_motion.grad is not None:
+            self.base_motion.grad[first:] = 0.0
+
     def _evaluate(self, positions: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
         """(N, 3), (K,) -> (K, N, 4): displacement [m] and change of log scale."""
         s = self.settings

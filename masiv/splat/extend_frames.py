@@ -239,6 +239,7 @@ class _ExtensionFit:
                 "lower reconstruct.motion_rate"
             )
         loss.backward()
+        self.network.hold_base_motion(self.frames)
         self.optimiser.step()
         frames = self.frames
         self.iteration += 1

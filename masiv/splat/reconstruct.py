@@ -317,6 +317,7 @@ class _Fit:
         for parameter, *each in zip(parameters(self.parameters, self.networks), *(g for _, g in found), strict=True):
             known = [gradient for gradient in each if gradient is not None]
             parameter.grad = sum(known[1:], known[0]) if known else None
+        self.network.hold_base_motion(self.frames)
         return sum(value for value, _ in found)
 
     def _choose_images(self, rng: np.random.Generator) -> list[tuple[int, int]]:
