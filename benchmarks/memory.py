@@ -98,12 +98,13 @@ def run(out: Path, name: str) -> None:
 
 
 def table(out: Path, names: Sequence[str]) -> str:
-    """Peak memory [MB] by case and stage."""
+    """Peak memory [MB] by case and stage; in brackets what was said before the stage."""
     rows = ["| case | " + " | ".join(STAGES) + " |", "|---" * (len(STAGES) + 1) + "|"]
     for name in names:
         if _done(out / name):
             stages = yaml.safe_load((out / name / "run" / "run.yaml").read_text())["stages"]
-            rows.append(f"| {name} | " + " | ".join(str(stages[stage]["peak_memory_mb"]) for stage in STAGES) + " |")
+            cells = (f"{s['peak_memory_mb']} ({s.get('expected_memory_mb', '-')})" for s in map(stages.get, STAGES))
+            rows.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(rows)
 
 

@@ -15,6 +15,7 @@ INTERVAL_S = 0.5
 MAX_SHARE = 0.02
 """Of the time of a core that samples may take, at most."""
 CONTROL_GROUPS = Path("/sys/fs/cgroup")
+"""Where Linux mounts the limits of containers."""
 GROWTH = 1.01
 """Resident memory that is this many times larger than any before is a new peak."""
 
@@ -30,7 +31,7 @@ def taken_bytes() -> float:
 def available_bytes(control_groups: Path = CONTROL_GROUPS) -> float:
     """Memory [bytes] that this machine still has, or the container that this process runs in, if that has less.
 
-    control_groups: where Linux mounts the limits of containers (cgroup v2, or v1 with its controller ``memory``).
+    control_groups: folder of the limits (cgroup v2, or v1 with its controller ``memory``).
     """
     left = float(psutil.virtual_memory().available)
     for maximum, used, cache in (

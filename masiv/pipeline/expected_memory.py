@@ -10,7 +10,7 @@ from masiv.config import Config
 from masiv.errors import InputError
 from masiv.identification.config import IdentifyConfig
 from masiv.memory import available_bytes, taken_bytes
-from masiv.mpm.config import SimulatorConfig
+from masiv.models.deformable import DeformableBody
 from masiv.mpm.simulator import kernels_bytes
 from masiv.scene.frame_cache import MAX_BYTES
 from masiv.scene.scene import Scene
@@ -65,12 +65,12 @@ class ExpectedMemory:
         if self.mb <= allowed:
             return
         reason = "memory_limit_mb allows" if limit_mb else "the machine has left"
-        large = [part for part in self.parts if part.less_with and part.mb > 0.05 * self.mb]
-        helpful = sorted(large or self.parts, key=lambda part: -part.mb)
+        helpful = sorted((part for part in self.parts if part.less_with), key=lambda part: -part.mb)
         less = "; ".join(f"{part.less_with} (now {_gb(part.mb)})" for part in helpful)
         raise InputError(
-            f"{self.stage} would take {self.text()}; {reason} {_gb(allowed)}. To take less: {less}. To start it all "
-            f"the same: memory_limit_mb={round(self.mb / 100 + 1) * 100}"
+            f"{self.stage} would take {self.text()}; {reason} {_gb(allowed)}. "
+            + (f"To take less: {less}. " if less else "")
+            + f"To start it all the same: memory_limit_mb={round(self.mb / 100 + 1) * 100}"
         )
 
 
@@ -105,17 +105,18 @@ def _pictures(stage: str, scene: Scene) -> MemoryPart:
 
 
 def _identify(config: Config, count: int) -> list[MemoryPart]:
-    identify, simulator = config.identify, config.simulator
-    search = _capacity_mb(min(count, identify.search_particles), simulator)
-    whole = _capacity_mb(count, simulator)
+    identify = config.identify
+    if identify.law == "springs":  # its rollouts keep their states elsewhere, within the same bound
+        return _simulating(config.simulator.memory_mb, 0.0, "")
+    search, whole = (_capacity_mb(n, config) for n in (min(count, identify.search_particles), count))
     processes = 1 if identify.scheduler else process_count(identify.processes)
     return _simulating(*max(_states(identify, processes, search, whole), key=sum), "identify.processes=1")
 
 
 def _refine(config: Config, count: int) -> list[MemoryPart]:
     """Candidates are fitted with few particles; those that are left are simulated with all, for discretisation."""
-    refine, simulator = config.refine, config.simulator
-    few, whole = (_capacity_mb(n, simulator) for n in (min(count, refine.particles), count))
+    refine = config.refine
+    few, whole = (_capacity_mb(n, config) for n in (min(count, refine.particles), count))
     both = whole if whole == few else whole + few
     processes = 1 if refine.scheduler else process_count(refine.processes)
     if processes == 1:
@@ -143,8 +144,12 @@ def _states(identify: IdentifyConfig, processes: int, search: float, whole: floa
     return [(both, 0.0)]
 
 
-def _capacity_mb(particles: int, simulator: SimulatorConfig) -> float:
-    return kernels_bytes(particles, simulator.memory_mb, 1024, simulator.grid_nodes, simulator.chunks) / 1e6
+def _capacity_mb(particles: int, config: Config) -> float:
+    """What a simulator of ``particles`` reserves in the memory of the machine; on CUDA it is that of the device."""
+    if config.arch == "cuda":
+        return 0.0
+    simulator, substeps = config.simulator, DeformableBody.max_substeps
+    return kernels_bytes(particles, simulator.memory_mb, substeps, simulator.grid_nodes, simulator.chunks) / 1e6
 
 
 def _available_mb() -> float:
