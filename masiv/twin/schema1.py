@@ -14,7 +14,8 @@ from masiv.mpm.config import SimulatorConfig
 from masiv.scene.scene import Ground
 from masiv.strict import shortened, validated
 from masiv.twin.body import Body, Boundary, InitialCondition, TwinEffect, with_start_values
-from masiv.twin.document import EffectPart, check_names, read_effect, read_particles
+from masiv.twin.document import check_names, read_effect, read_particles
+from masiv.twin.document_parts import EffectPart
 
 BODY, OBSERVATION = "body", "observation"
 """Names for what had none."""
