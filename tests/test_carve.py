@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ring_scene import ring, spheres_scene
+from scipy import ndimage
 
 from masiv.errors import InputError, MasivError
 from masiv.hull.carve import visual_hull
@@ -13,6 +14,17 @@ CENTRE, RADIUS = np.array([0.15, 0.5, -0.1]), 0.25
 
 def one_sphere(frame: int) -> list:
     return [(CENTRE, RADIUS)]
+
+
+def test_signed_distance_is_that_to_the_nearest_pixel_of_the_other_kind():
+    """Of blobs, some of which touch the border, against all pairs of pixels."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        mask = ndimage.gaussian_filter(rng.random(rng.integers(4, 24, 2)), 2.0)
+        on = mask > np.median(mask)
+        pixels = np.argwhere(np.ones_like(on)).reshape(*on.shape, 2)
+        to_on, to_off = (np.linalg.norm(pixels[:, :, None] - pixels[kind], axis=-1).min(-1) for kind in (on, ~on))
+        assert np.allclose(signed_distance(on), np.where(on, 0.5 - to_off, to_on - 0.5), atol=1e-4)
 
 
 def test_signed_distance_of_a_half_plane():

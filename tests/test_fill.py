@@ -79,8 +79,9 @@ def test_rendered_surface_carves_what_silhouettes_cannot_see(taichi):
     dynamic = still(sphere_points(1500, 0.7 * RADIUS), 0.012)
     shell, core = sphere_points(300, 0.97 * RADIUS), sphere_points(300, 0.6 * RADIUS)
     facing = shell[np.abs(shell[:, 1] - CENTRE[1] - 0.05) < 0.3 * RADIUS]
-    assert (depth_in_front(scene, dynamic, 0, facing) > 0.01).mean() > 0.7
-    assert not (depth_in_front(scene, dynamic, 0, core) > 0.01).any()
+    cameras = [scene.cameras[view] for view in scene.views]
+    assert (depth_in_front(dynamic, cameras, 0.0, facing) > 0.01).mean() > 0.7
+    assert not (depth_in_front(dynamic, cameras, 0.0, core) > 0.01).any()
     hull, carved = fill_volume(scene, None, 0, CONFIG), fill_volume(scene, dynamic, 0, CONFIG)
     assert carved.volume < 0.85 * hull.volume
     assert carved.volume > (0.7 * RADIUS) ** 3 * 4 / 3 * np.pi * 0.95

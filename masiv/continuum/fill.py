@@ -7,6 +7,7 @@ threshold.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,16 +118,16 @@ def density_field(
         return cloud_volume(
             scene.cloud(frame), config.fill_resolution, scene.ground, f"the cloud of frame {frame} of {scene.path}"
         )
-    hull = visual_hull(scene, frame, resolution=config.fill_resolution)
+    views = silhouettes(scene, frame, config.fill_resolution)
+    hull = visual_hull(scene, frame, resolution=config.fill_resolution, views=views)
     if volume is not None:
-        hull = remove_shadow_volume(scene, frame, hull, volume)
+        hull = remove_shadow_volume(scene, frame, hull, volume, views)
     if mirror is not None:
         hull = symmetric_hull(hull, mirror)
     spacing = hull.spacing
     margin = 2
     lower = hull.points.min(axis=0) - margin * spacing
     index = np.rint((hull.points - lower) / spacing).astype(int)
-    views = silhouettes(scene, frame, config.fill_resolution)
     outside = _outside_of_masks(views, hull.points, 0.25 * spacing)
     for depth in depth_views(scene, frame, views):
         outside = np.maximum(outside, np.maximum(depth.outside(hull.points), depth.behind(hull.points)))
@@ -145,7 +146,7 @@ def density_field(
     if dynamic is None:
         field = smoothed(None)
     else:
-        excess = depth_in_front(scene, dynamic, frame, hull.points)
+        excess = depth_in_front(dynamic, [view.camera for view in views], frame / scene.fps, hull.points)
         tolerance = config.depth_tolerance * spacing
         field = smoothed(excess > tolerance)
         while prior is not None and field.volume < prior.lower and (excess > tolerance).any():
@@ -167,15 +168,14 @@ def _outside_of_masks(views: tuple[Silhouette, ...], points: np.ndarray, toleran
     return np.where(first > tolerance, second, first)
 
 
-def depth_in_front(scene: Scene, dynamic: DynamicGaussians, frame: int, points: np.ndarray) -> np.ndarray:
-    """How far points (N, 3) [m] are in front of the rendered surface for two views or more, (N,) [m].
+def depth_in_front(dynamic: DynamicGaussians, cameras: Sequence[Camera], time: float, points: np.ndarray) -> np.ndarray:
+    """How far points (N, 3) [m] are in front of the surface that two cameras or more show at ``time`` [s], (N,) [m].
 
-    The second largest of the differences in depth; minus infinity where fewer than two views show a point.
+    The second largest of the differences in depth; minus infinity where fewer than two cameras show a point.
     """
     first, second = np.full((2, len(points)), -np.inf)
-    for view in scene.views:
-        camera = scene.cameras[view]
-        depth = surface_depth(dynamic, camera, frame / scene.fps)
+    for camera in cameras:
+        depth = surface_depth(dynamic, camera, time)
         # The smallest of 3 x 3 pixels: at an edge the depth of a pixel is a mean over object and background.
         depth = ndimage.minimum_filter(depth, size=3, mode="nearest")
         pixels, along = camera.project(points)

@@ -39,16 +39,20 @@ class VisualHull:
         return round(float(np.ptp(self.points, axis=0).max()) / self.spacing) + 1
 
 
-def visual_hull(scene: Scene, frame: int, *, resolution: int = 64) -> VisualHull:
+def visual_hull(
+    scene: Scene, frame: int, *, resolution: int = 64, views: tuple[Silhouette, ...] | None = None
+) -> VisualHull:
     """Carve the hull of the object at ``frame`` from the masks of all views that are not held out.
 
     The bounding box follows from the masks; its longest side gets ``resolution`` voxels. A voxel is kept if its centre
     is at most a quarter voxel outside of every mask that shows it (so that thin parts survive) and if it is inside the
     image of at least two views and of half of them. Measured depth removes what is in front of the surface; with it
-    one view suffices, and the hidden side is a guess (``masiv.hull.depth``). Raises MasivError if fewer than two masks
-    show the object, fewer than one with depth, or no voxel is left.
+    one view suffices, and the hidden side is a guess (``masiv.hull.depth``). views: ``silhouettes`` of the frame, if
+    they are at hand. Raises MasivError if fewer than two masks show the object, fewer than one with depth, or no voxel
+    is left.
     """
-    views = silhouettes(scene, frame, resolution)
+    if views is None:
+        views = silhouettes(scene, frame, resolution)
     depths = depth_views(scene, frame, views)
     occupied_views = [v for v in views if (v.distance < 0).any()]
     if len(occupied_views) < 2 and (not depths or not occupied_views):

@@ -11,6 +11,8 @@ def distance_to_zero(mask: np.ndarray) -> np.ndarray:
 
     Equal masks have bit-equal distances below 2,000 pixels.
     """
-    distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
+    distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     # OpenCV rounds the root in a way that depends on the alignment of its buffers. Squared distances are integers.
-    return np.sqrt(np.rint(distance * distance)).astype(np.float32)
+    squared = np.square(distance, dtype=np.float64)
+    np.rint(squared, out=squared)
+    return np.sqrt(squared, out=squared).astype(np.float32)

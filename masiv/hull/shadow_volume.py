@@ -19,18 +19,22 @@ _CONTACT_TOLERANCE = 2.0
 """A hull touches the ground if it is at most this far above it [voxels]: the ground's height is uncertain."""
 
 
-def remove_shadow_volume(scene: Scene, frame: int, hull: VisualHull, volume: float) -> VisualHull:
+def remove_shadow_volume(
+    scene: Scene, frame: int, hull: VisualHull, volume: float, views: tuple[Silhouette, ...] | None = None
+) -> VisualHull:
     """``hull`` of ``frame`` without its highest voxels, so that ``MAX_VOLUME_RATIO`` times ``volume`` [m³] is left.
 
     volume: of the hull at frame 0. The hull is returned unchanged if it is not larger than that, if it does not touch
-    the ground, and if the scene has no ground or gravity does not point towards it.
+    the ground, and if the scene has no ground or gravity does not point towards it. views: ``silhouettes`` of the
+    frame, if they are at hand.
     """
     ground = scene.ground
     if ground is None or scene.gravity @ ground.normal >= 0 or hull.volume <= MAX_VOLUME_RATIO * volume:
         return hull
     if (hull.points @ ground.normal).min() - ground.height > _CONTACT_TOLERANCE * hull.spacing:
         return hull
-    views = silhouettes(scene, frame, hull.resolution)
+    if views is None:
+        views = silhouettes(scene, frame, hull.resolution)
     kept = keep_lowest_voxels(hull.points, hull.spacing, views, ground.normal, MAX_VOLUME_RATIO * volume)
     points = hull.points[kept]
     index = np.rint((points - points.min(axis=0)) / hull.spacing).astype(int)

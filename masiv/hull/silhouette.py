@@ -123,11 +123,15 @@ def signed_distance(mask: np.ndarray) -> np.ndarray:
     diagonal = float(np.hypot(*mask.shape))
     if not on.any():
         return np.full(mask.shape, diagonal, np.float32)
-    outwards = distance_to_zero(1 - on)
-    # The object may continue beyond the border, so the border is not an edge of the mask.
+    distance = distance_to_zero(1 - on) - np.float32(0.5)
+    # The object may continue beyond the border, so the border is not an edge of the mask. The box around the object and
+    # one pixel more on each side has the edges of all pixels on it.
     padded = cv2.copyMakeBorder(on, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    inwards = distance_to_zero(padded)[1:-1, 1:-1]
-    return np.where(on > 0, 0.5 - np.minimum(inwards, diagonal), outwards - 0.5).astype(np.float32)
+    column, row, width, height = cv2.boundingRect(on)
+    inwards = distance_to_zero(padded[row : row + height + 2, column : column + width + 2])[1:-1, 1:-1]
+    box = slice(row, row + height), slice(column, column + width)
+    np.copyto(distance[box], np.float32(0.5) - np.minimum(inwards, np.float32(diagonal)), where=on[box] > 0)
+    return distance
 
 
 def sample_bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
