@@ -41,8 +41,9 @@ class FilmedBody:
         samples: int = 1,
         chosen: np.ndarray | None = None,
         known: Sequence[tuple[Effect, torch.Tensor]] = (),
+        max_substeps: int = DeformableBody.max_substeps,
     ) -> None:
-        """chosen (N,): which particles of the motion are simulated; None: all."""
+        """chosen (N,): which particles of the motion are simulated; None: all. max_substeps: see ``DeformableBody``."""
         self.scene = scene
         self.samples = samples
         self.frames = len(motion.times) - 1
@@ -62,6 +63,7 @@ class FilmedBody:
             gravity=self.axes.vectors_to_simulation(scene.gravity),
             config=simulator,
             speed=float((span[1:] - span[:-1]).norm(dim=2).max()) * samples * scene.fps,
+            max_substeps=max_substeps,
         )
         self.known = tuple(known)
 

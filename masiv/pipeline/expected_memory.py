@@ -11,7 +11,7 @@ from masiv.errors import InputError
 from masiv.identification.config import IdentifyConfig
 from masiv.memory import available_bytes, taken_bytes
 from masiv.models.deformable import DeformableBody
-from masiv.mpm.simulator import kernels_bytes
+from masiv.mpm.simulator import SUBSTEPS_UNIT, kernels_bytes
 from masiv.scene.frame_cache import MAX_BYTES
 from masiv.scene.scene import Scene
 from masiv.workers import process_count
@@ -116,8 +116,8 @@ def _identify(config: Config, count: int) -> list[MemoryPart]:
 def _refine(config: Config, count: int) -> list[MemoryPart]:
     """Candidates are fitted with few particles; those that are left are simulated with all, for discretisation."""
     refine = config.refine
-    few, whole = (_capacity_mb(n, config) for n in (min(count, refine.particles), count))
-    both = whole if whole == few else whole + few
+    few = _capacity_mb(min(count, refine.particles), config)
+    both = few + _capacity_mb(count, config, SUBSTEPS_UNIT)  # finer grids need no adjoint
     processes = 1 if refine.scheduler else process_count(refine.processes)
     if processes == 1:
         return _simulating(few if refine.scheduler else both, 0.0, "")
@@ -144,11 +144,12 @@ def _states(identify: IdentifyConfig, processes: int, search: float, whole: floa
     return [(both, 0.0)]
 
 
-def _capacity_mb(particles: int, config: Config) -> float:
-    """What a simulator of ``particles`` reserves in the memory of the machine; on CUDA it is that of the device."""
+def _capacity_mb(particles: int, config: Config, substeps: int = DeformableBody.max_substeps) -> float:
+    """What a simulator of ``particles`` that keeps ``substeps`` reserves in the memory of the machine; on CUDA it is
+    that of the device."""
     if config.arch == "cuda":
         return 0.0
-    simulator, substeps = config.simulator, DeformableBody.max_substeps
+    simulator = config.simulator
     return kernels_bytes(particles, simulator.memory_mb, substeps, simulator.grid_nodes, simulator.chunks) / 1e6
 
 

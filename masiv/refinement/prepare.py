@@ -14,6 +14,7 @@ from masiv.models.free_body import FreeBodySetup
 from masiv.models.initial_state import InitialMotion, InitialState, estimate_initial_motion
 from masiv.mpm.config import SimulatorConfig
 from masiv.mpm.design import grid_spacing
+from masiv.mpm.simulator import SUBSTEPS_UNIT
 from masiv.observations.motion import Observed
 from masiv.observations.noise_floor import noise_floor
 from masiv.observations.video import VideoObservation
@@ -53,8 +54,15 @@ def prepare(
     chosen, fewest = (kd_tree_subset(fitted.positions[0], n) for n in (config.particles, config.search_particles))
     coarse = FilmedBody(scene, fitted, on_coarse, samples=samples, chosen=chosen)
     coarser = FilmedBody(scene, fitted, on_coarser, samples=samples, chosen=fewest)
+    # Rollouts on finer grids need no adjoint: no state is kept beyond the few that the kernels work on.
     finer = tuple(
-        FilmedBody(scene, whole, finer_than(coarse, count, thinned(simulator, part)), samples=samples)
+        FilmedBody(
+            scene,
+            whole,
+            finer_than(coarse, count, thinned(simulator, part)),
+            samples=samples,
+            max_substeps=SUBSTEPS_UNIT,
+        )
         for part in FINER_PARTICLES_PER_CELL
     )
     body = FilmedBody(scene, whole, on_coarse, samples=samples, chosen=chosen).with_first_targets(coarse)
