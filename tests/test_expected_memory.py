@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from ball import ball_scene
@@ -11,7 +12,9 @@ from masiv.config import load_config
 from masiv.errors import InputError
 from masiv.memory import available_bytes
 from masiv.mpm.simulator import kernels_bytes
-from masiv.pipeline.expected_memory import expected_memory
+from masiv.pipeline.expected_memory import expected_memory, expected_tracks_memory
+from masiv.pipeline.requests import Overrides, SceneRequest
+from masiv.pipeline.tracks import TracksRun
 
 
 def config(*assignments):
@@ -36,6 +39,23 @@ def test_a_setting_that_takes_more_is_expected_to(stage, more):
 
 def test_refine_takes_less_in_one_process():
     assert expected("refine", "refine.processes=1") < expected("refine", "refine.processes=2") - 500
+
+
+def test_more_particles_of_a_body_with_markers_take_more():
+    few, many = (
+        expected_tracks_memory("identify", config(f"tracks.particles={n}"), flights=False).mb for n in (1000, 5000)
+    )
+    assert many > few + 100
+    flights = expected_tracks_memory("identify", config("tracks.particles=5000"), flights=True)
+    assert flights.mb < few
+
+
+def test_tracks_that_do_not_fit_are_refused_before_anything_is_made(tmp_path):
+    scene, out = Path(__file__).parent / "golden" / "balls", tmp_path / "run"
+    run = TracksRun.open(scene, out, Overrides(assignments=("memory_limit_mb=100",)), SceneRequest())
+    with pytest.raises(InputError, match=r"identify would take about 0\.4 GB.*memory_limit_mb allows 0\.1 GB"):
+        run.identify()
+    assert not (out / "twin.yaml").exists()
 
 
 @pytest.mark.parametrize("less", ["identify.processes=1", "simulator.memory_mb=300", "identify.law=neo_hookean"])

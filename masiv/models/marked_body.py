@@ -32,6 +32,8 @@ from masiv.tracks.placement import Placement
 from masiv.tracks.prescribed_motion import PrescribedMotion, Segment, prescribed_motions
 from masiv.tracks.tracks import Clamp, Run, Tracks
 
+MAX_SUBSTEPS = 256
+"""Of a rollout, whose states are kept at once."""
 TILT_WEIGHT = 1e-3
 """Weight of the rotation's trace relative to the height of y: it decides between equal choices of axes."""
 SETTLING_SUBSTEPS = 32
@@ -293,7 +295,7 @@ def placed_body(
             HeldRegion(torch.as_tensor(n), torch.as_tensor(h + n @ axes.translation))
             for n, h in zip(normals, heights, strict=True)
         ),
-        max_substeps=256,
+        max_substeps=MAX_SUBSTEPS,
         contact=contact,
         attachment=attach(particles, axes.points_to_simulation(at_rest), particle_spacing),
         markers=markers,

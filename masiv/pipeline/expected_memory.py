@@ -11,6 +11,7 @@ from masiv.errors import InputError
 from masiv.identification.config import IdentifyConfig
 from masiv.memory import available_bytes, taken_bytes
 from masiv.models.deformable import DeformableBody
+from masiv.models.marked_body import MAX_SUBSTEPS
 from masiv.mpm.simulator import SUBSTEPS_UNIT, kernels_bytes
 from masiv.scene.frame_cache import MAX_BYTES
 from masiv.scene.scene import Scene
@@ -26,6 +27,10 @@ FIT_PROCESS_MB = 290
 """The one that fits a second starting law, without what its simulator reserves [MB]."""
 REFINE_PROCESS_MB = 340
 """One that fits effects, without what its simulators reserve [MB]."""
+TRACKS_MB = {"identify": 500, "refine": 545}
+"""The one process that simulates a body with markers, without what its simulator reserves [MB]."""
+FLIGHTS_MB = {"identify": 435, "refine": 475}
+"""The one process that solves for bodies in free flight [MB]."""
 BYTES_A_PIXEL, BYTES_A_DEPTH = 8, 4
 """Of a picture with its mask, and of its depth."""
 BYTES_READ_A_PIXEL = {"reconstruct": 5, "trajectory": 28, "identify": 5}
@@ -87,6 +92,15 @@ def expected_memory(stage: str, scene: Scene, config: Config, particles: int | N
     else:
         parts = _refine(config, count)
     return ExpectedMemory(stage, (MemoryPart("the process", MAIN_MB[stage], ""), *parts))
+
+
+def expected_tracks_memory(stage: str, config: Config, *, flights: bool) -> ExpectedMemory:
+    """Of "identify" or "refine" of tracks. flights: of bodies in free flight, without particles."""
+    if flights:
+        return ExpectedMemory(stage, (MemoryPart("the process", FLIGHTS_MB[stage], ""),))
+    states = _capacity_mb(config.tracks.particles, config, MAX_SUBSTEPS)
+    parts = MemoryPart("the process", TRACKS_MB[stage], ""), MemoryPart("states", states, "lower tracks.particles")
+    return ExpectedMemory(stage, parts)
 
 
 def _second_process(config: Config) -> list[MemoryPart]:

@@ -104,7 +104,7 @@ class TracksRun(Run):
         if self.folder.done("identify"):
             twin = self.load_twin()
         else:
-            with self.folder.stage("identify"):
+            with self.folder.stage("identify", self._say_memory("identify", progress)):
                 twin, fits = identify_tracks(
                     self.tracks, self.config.identify.law, self.config.tracks, self.config.simulator,
                     folder=self._rollout_cache, progress=progress,
@@ -144,6 +144,7 @@ class TracksRun(Run):
         from masiv.refinement.to_twin import refined_twin
         from masiv.twin.identified import load_to_refine, save_refined
 
+        self._say_memory("refine", progress)
         first = self._conditions[0]
         twin = load_to_refine(self.path, request.condition, self._described_twin)
         if request.group and not twin.rigid:
@@ -215,6 +216,16 @@ class TracksRun(Run):
             write_json(self.folder.evaluation, numbers)
         data = {"evaluation": str(self.folder.evaluation), **numbers}
         return Summary(data, "\n".join([*_table(rows), str(self.folder.evaluation)]))
+
+    def _say_memory(self, stage: str, progress: Progress) -> float:
+        """Say how much memory the stage is expected to take [MB]. Raises InputError if that is too much."""
+        from masiv.identification.from_tracks import flight_group
+        from masiv.pipeline.expected_memory import expected_tracks_memory
+
+        expected = expected_tracks_memory(stage, self.config, flights=flight_group(self.tracks) is not None)
+        expected.require(self.config.memory_limit_mb)
+        progress(stage, 0, 1, expected.text())
+        return expected.mb
 
     @property
     def _rollout_cache(self) -> Path:
