@@ -281,6 +281,15 @@ def refuse_run(folder: Path, option: str) -> None:
         raise InputError(f"{option} {folder} is a run folder: give another one, so that nothing of the run is replaced")
 
 
+def require_folder(folder: Path, option: str) -> None:
+    """Raises InputError if ``folder``, given with ``option``, is a run, is no folder or cannot be made."""
+    refuse_run(folder, option)
+    present = next(part for part in (folder, *folder.absolute().parents) if part.exists())
+    if not present.is_dir() or not os.access(present, os.W_OK):
+        kind = "a folder that you may not write to" if present.is_dir() else "a file"
+        raise InputError(f"{option} {folder} cannot be made: {present} is {kind}; give another folder")
+
+
 def load_motion(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, Q, 3) float32 [m, world] and times (T,) [s] of a rollout.npz. Raises InputError."""
     try:

@@ -82,6 +82,13 @@ def test_simulate_does_not_write_into_a_run_folder(run):
     assert content(run.path) == before
 
 
+def test_simulate_says_at_once_that_its_folder_cannot_be_made(run, tmp_path):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "deeper" / "out"):
+        with pytest.raises(masiv.InputError, match=r"cannot be made: .*file is a file"):
+            run.simulate(SimulateRequest(4), out)
+
+
 def test_the_scene_of_a_moved_run_is_given_anew_and_remembered(run, tmp_path):
     alone = shutil.move(run.path, tmp_path / "elsewhere" / "run")
     with pytest.raises(masiv.InputError, match="say where it is with --scene"):

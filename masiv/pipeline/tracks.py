@@ -22,7 +22,7 @@ from masiv.pipeline.requests import (
 )
 from masiv.pipeline.run import Run, settings
 from masiv.progress import Progress, silent
-from masiv.runfolder import Request, RunFolder, refuse_run
+from masiv.runfolder import Request, RunFolder, require_folder
 from masiv.strict import read_json
 from masiv.tracks.read import read_tracks
 from masiv.tracks.tracks import Tracks
@@ -174,7 +174,7 @@ class TracksRun(Run):
     def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
         refuse(request, NOT_FOR_TRACKS, "pictures", self.scene_path)
         self.folder.require("identify")
-        refuse_run(out, "--out")
+        require_folder(out, "--out")
         self.start()
         from masiv.simulation.simulate import simulate
 

@@ -26,7 +26,7 @@ from masiv.pipeline.requests import (
 )
 from masiv.pipeline.run import Run, reopen_run, settings
 from masiv.progress import Progress, silent
-from masiv.runfolder import Request, RunFolder, refuse_run
+from masiv.runfolder import Request, RunFolder, require_folder
 from masiv.scene.calibration import Calibration
 from masiv.scene.camera import Camera
 from masiv.scene.scene import Scene
@@ -185,7 +185,7 @@ class VideoRun(Run):
     def simulate(self, request: SimulateRequest, out: Path, progress: Progress = silent) -> Summary:
         refuse(request, ("condition",), "tracks", self.scene_path)
         self.folder.require("identify")
-        refuse_run(out, "--out")
+        require_folder(out, "--out")
         views, cameras, size = self._views(request)
         if request.force is None and (request.force_from is not None or request.force_until is not None):
             raise InputError("--force-from and --force-until need --force FX,FY,FZ")
