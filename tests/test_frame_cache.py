@@ -7,9 +7,11 @@ import pickle
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from masiv.scene.camera import Camera
 from masiv.scene.frame_cache import Frame, FrameCache
+from masiv.scene.packed_mask import PackedMask
 from masiv.scene.scene import Scene
 from masiv.scene.summary import summarise
 
@@ -105,3 +107,45 @@ def test_released_pictures_are_read_again():
     whole.release_pictures()
     part.frame(1, 0)
     assert reader.read == [(1, 0), (1, 0)]
+
+
+def noisy(view, frame):
+    """A frame with a soft mask; every second one is partly hidden."""
+    rng = np.random.default_rng((view, frame))
+    mask = np.zeros((SIZE, SIZE), np.float32)
+    mask[2:6, 3:9] = rng.random((4, 6), np.float32)
+    valid = rng.random((SIZE, SIZE)) > 0.3 if frame % 2 else np.ones((SIZE, SIZE), bool)
+    return Frame(np.zeros((SIZE, SIZE, 3), np.uint8), mask, valid)
+
+
+def test_masks_of_frames_that_were_dropped_are_not_read_again():
+    read = []
+
+    def load(view, frame):
+        read.append((view, frame))
+        return noisy(view, frame)
+
+    whole = scene(FrameCache(load, max_bytes=2 * FRAME_BYTES * 3))
+    for _ in range(3):
+        for frame in range(4):
+            for view, mask, valid in whole.map_masks(frame, lambda *given: given):
+                assert np.array_equal(mask, noisy(view, frame).mask)
+                assert np.array_equal(valid, noisy(view, frame).valid)
+                assert (mask.dtype, valid.dtype) == (np.float32, bool)
+    assert len(read) < 24
+    assert len(whole.map_masks(3, lambda *given: given)) == 3
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
+def test_a_mask_that_is_packed_is_the_same_again(level):
+    mask, valid = np.full((7, 5), level, np.float32), np.zeros((7, 5), bool)
+    packed = PackedMask.of(mask, valid)
+    assert np.array_equal(packed.unpacked()[0], mask)
+    assert np.array_equal(packed.unpacked()[1], valid)
+
+
+def test_packed_masks_are_bounded():
+    cache = FrameCache(noisy, max_bytes=FRAME_BYTES)
+    for frame in range(100):
+        cache.mask(0, frame)
+    assert sum(packed.nbytes for packed in cache._packed.values()) < FRAME_BYTES

@@ -9,7 +9,7 @@ import numpy as np
 
 from masiv.hull.distance import distance_to_zero
 from masiv.scene.camera import Camera
-from masiv.scene.scene import Frame, Scene
+from masiv.scene.scene import Scene
 
 PIXELS_A_VOXEL = 4
 """Of a mask along the side of a hull's voxel, at least, if it is averaged down: a hull's tolerance, a quarter of a
@@ -74,10 +74,10 @@ def silhouettes(scene: Scene, frame: int, resolution: int | None = None) -> tupl
     """
     side = None if resolution is None or scene.depth_noise is not None else PIXELS_A_VOXEL * resolution
 
-    def of(view: int, picture: Frame) -> Silhouette:
-        return silhouette(view, *_reduced(scene.cameras[view], picture.mask, picture.valid, side))
+    def of(view: int, mask: np.ndarray, valid: np.ndarray) -> Silhouette:
+        return silhouette(view, *_reduced(scene.cameras[view], mask, valid, side))
 
-    found = scene.map_views(frame, of)
+    found = scene.map_masks(frame, of)
     if scene.velocities is None:
         return tuple(found)
     velocity = scene.velocities[frame]

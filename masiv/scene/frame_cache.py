@@ -1,4 +1,5 @@
-"""Frames that were read, up to a number of bytes; the one that was not used for the longest time is dropped first."""
+"""Frames that were read, up to a number of bytes; the one that was not used for the longest time is dropped first.
+Masks of those that were dropped stay."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from masiv.memory import return_freed
+from masiv.scene.packed_mask import PackedMask
 
 MAX_BYTES = 1 << 29
 """Of the frames that one scene keeps [bytes]."""
@@ -20,6 +22,8 @@ MAX_BYTES_OF_WORKER = 1 << 27
 RETURNED_SHARE = 0.25
 """Memory of dropped frames goes back to the system when it is this share of what is kept: arrays of other sizes leave
 gaps between them, which would add up to as much as is kept."""
+PACKED_SHARE = 1 / 8
+"""Packed masks take at most this share of what frames do. One with the noise of an estimate is not small."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +48,16 @@ class Frame:
 
 
 class FrameCache:
-    """``load(view, frame)``, which reads a ``Frame``, with the frames read last, at most ``max_bytes``. Threads may
-    share it."""
+    """``load(view, frame)``, which reads a ``Frame``, with the frames read last, at most ``max_bytes``, and the masks
+    of others, packed. Threads may share it."""
 
     def __init__(self, load: Callable[[int, int], Frame], max_bytes: int = MAX_BYTES) -> None:
         self.load = load
         self.max_bytes = max_bytes
         self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
-        self._bytes, self._dropped = 0, 0
+        self._packed: dict[tuple[int, int], PackedMask] = {}
+        self._bytes, self._dropped, self._packed_bytes = 0, 0, 0
+        self._full = False
         self._lock = threading.Lock()
 
     def __call__(self, view: int, frame: int) -> Frame:
@@ -65,6 +71,21 @@ class FrameCache:
         self.put(view, frame, found)
         return found
 
+    def mask(self, view: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """``mask`` and ``valid`` of a frame, which is read only if it has not been before."""
+        key = view, frame
+        with self._lock:
+            packed = None if key in self._frames else self._packed.get(key)
+        if packed is not None:
+            return packed.unpacked()
+        found = self(view, frame)
+        if self._full and self._packed_bytes < self.max_bytes * PACKED_SHARE and key not in self._packed:
+            packed = PackedMask.of(found.mask, found.valid)
+            with self._lock:
+                self._packed[key] = packed
+                self._packed_bytes += packed.nbytes
+        return found.mask, found.valid
+
     def put(self, view: int, frame: int, found: Frame) -> None:
         """Keep a frame that was read otherwise."""
         with self._lock:
@@ -72,6 +93,7 @@ class FrameCache:
             self._frames[view, frame] = found
             self._bytes += found.nbytes
             while self._bytes > self.max_bytes and len(self._frames) > 1:
+                self._full = True
                 _, oldest = self._frames.popitem(last=False)
                 self._bytes -= oldest.nbytes
                 self._dropped += oldest.nbytes
@@ -80,11 +102,11 @@ class FrameCache:
                 return_freed()
 
     def clear(self) -> None:
-        """Keep no frame."""
+        """Keep no frame; masks stay, which are small."""
         with self._lock:
             self._frames.clear()
             self._bytes = 0
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled without its frames: another process reads those that it needs, and keeps fewer."""
+        """Pickled without its frames and masks: another process reads those that it needs, and keeps fewer."""
         return FrameCache, (self.load, min(self.max_bytes, MAX_BYTES_OF_WORKER))

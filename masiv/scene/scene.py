@@ -123,9 +123,18 @@ class Scene:
 
         Raises InputError if the frame or the view is held out or does not exist.
         """
+        return self._cache(view, frame)(view, frame)
+
+    def mask(self, view: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """``mask`` (H, W) and ``valid`` (H, W) of ``frame(view, frame)``."""
+        return self._cache(view, frame).mask(view, frame)
+
+    def _cache(self, view: int, frame: int) -> FrameCache:
+        """That of the masks that are used. Raises InputError if the frame is not of this scene."""
         if not 0 <= frame < self.frame_count or view not in self.views:
             raise InputError(f"view {view}, frame {frame} of {self.path} is held out from this stage or does not exist")
-        return self.load(view, frame) if self.correct_masks is None else self._corrected(view, frame)
+        assert isinstance(self.load, FrameCache)
+        return self.load if self.correct_masks is None else self._corrected
 
     def release_pictures(self) -> None:
         """Free the memory of the pictures that were read; those that are needed again are read again."""
@@ -138,8 +147,18 @@ class Scene:
         """``function(view, picture)`` of each view of ``frame`` that is not held out, in a thread a core."""
         if self.correct_masks is not None and self.views:
             self.frame(self.views[0], frame)  # makes those of all views
+        return self._map(lambda view: function(view, self.frame(view, frame)))
+
+    def map_masks(self, frame: int, function: Callable[[int, np.ndarray, np.ndarray], T]) -> list[T]:
+        """``function(view, mask, valid)`` as ``map_views``. A mask that was asked for before is not read again, even if
+        its picture was dropped."""
+        if self.views:
+            self.mask(self.views[0], frame)  # makes those of all views, if they are made to agree
+        return self._map(lambda view: function(view, *self.mask(view, frame)))
+
+    def _map(self, function: Callable[[int], T]) -> list[T]:
         with ThreadPoolExecutor(os.cpu_count()) as threads:
-            return list(threads.map(lambda view: function(view, self.frame(view, frame)), self.views))
+            return list(threads.map(function, self.views))
 
     @cached_property
     def _corrected(self) -> FrameCache:
