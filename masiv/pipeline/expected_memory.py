@@ -13,6 +13,7 @@ from masiv.memory import available_bytes, taken_bytes
 from masiv.models.deformable import DeformableBody
 from masiv.models.marked_body import MAX_SUBSTEPS
 from masiv.mpm.simulator import SUBSTEPS_UNIT, kernels_bytes
+from masiv.progress import Progress
 from masiv.scene.frame_cache import MAX_BYTES
 from masiv.scene.scene import Scene
 from masiv.workers import process_count
@@ -77,6 +78,12 @@ class ExpectedMemory:
             + (f"To take less: {less}. " if less else "")
             + f"To start it all the same: memory_limit_mb={round(self.mb / 100 + 1) * 100}"
         )
+
+    def announce(self, limit_mb: float, progress: Progress) -> float:
+        """Say the whole [MB] before the stage begins, and return it. Raises InputError as ``require``."""
+        self.require(limit_mb)
+        progress(self.stage, 0, 1, self.text())
+        return self.mb
 
 
 def expected_memory(stage: str, scene: Scene, config: Config, particles: int | None = None) -> ExpectedMemory:

@@ -36,8 +36,7 @@ def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Prog
     recordings = [recording_of(run, progress) for run in runs]
     particles = max(r.motion.positions.shape[1] for r in recordings)
     memory = expected_memory("refine", recordings[0].scene, first.config, particles)
-    memory.require(first.config.memory_limit_mb)
-    progress("refine", 0, 1, memory.text())
+    memory.announce(first.config.memory_limit_mb, progress)
     twin = load_identified(first.path)
     checkpoint = first.folder.checkpoint("refine")
     result = refine_recordings(

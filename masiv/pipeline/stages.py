@@ -151,10 +151,7 @@ def _say_memory(
 ) -> float:
     """Say how much memory the stage is expected to take [MB]. Raises InputError if that is too much."""
     visible = scene.restricted(run.fit_frames, run.holdout_cameras)
-    expected = expected_memory(stage, visible, config, particles)
-    expected.require(config.memory_limit_mb)
-    progress(stage, 0, 1, expected.text())
-    return expected.mb
+    return expected_memory(stage, visible, config, particles).announce(config.memory_limit_mb, progress)
 
 
 def other_recordings(config: Config) -> list[tuple[Scene, Trajectory]]:

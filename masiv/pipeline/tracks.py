@@ -223,9 +223,7 @@ class TracksRun(Run):
         from masiv.pipeline.expected_memory import expected_tracks_memory
 
         expected = expected_tracks_memory(stage, self.config, flights=flight_group(self.tracks) is not None)
-        expected.require(self.config.memory_limit_mb)
-        progress(stage, 0, 1, expected.text())
-        return expected.mb
+        return expected.announce(self.config.memory_limit_mb, progress)
 
     @property
     def _rollout_cache(self) -> Path:

@@ -57,7 +57,7 @@ class FrameCache:
         self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
         self._packed: dict[tuple[int, int], PackedMask] = {}
         self._bytes, self._dropped, self._packed_bytes = 0, 0, 0
-        self._full = False
+        self._full = False  # until the first frame is dropped, masks need not be packed
         self._lock = threading.Lock()
 
     def __call__(self, view: int, frame: int) -> Frame:

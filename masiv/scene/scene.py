@@ -152,8 +152,8 @@ class Scene:
     def map_masks(self, frame: int, function: Callable[[int, np.ndarray, np.ndarray], T]) -> list[T]:
         """``function(view, mask, valid)`` as ``map_views``. A mask that was asked for before is not read again, even if
         its picture was dropped."""
-        if self.views:
-            self.mask(self.views[0], frame)  # makes those of all views, if they are made to agree
+        if self.correct_masks is not None and self.views:
+            self.mask(self.views[0], frame)  # makes those of all views
         return self._map(lambda view: function(view, *self.mask(view, frame)))
 
     def _map(self, function: Callable[[int], T]) -> list[T]:
