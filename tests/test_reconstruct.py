@@ -1,6 +1,7 @@
 """Reconstruction of a small textured ball that falls and is squashed, drawn by the rasteriser's own float64 twin."""
 
 import dataclasses
+import time
 from pathlib import Path
 
 import numpy as np
@@ -260,8 +261,11 @@ def test_a_second_process_that_dies_is_told_of_and_none_is_left(scene, monkeypat
 def test_the_second_process_keeps_the_module_path_of_this_one(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/of/the/user")
     with GradientWorker() as worker:
-        environment = Path(f"/proc/{worker._process.pid}/environ").read_bytes().split(b"\0")
-    assert b"PYTHONPATH=/of/the/user" in environment
+        shown = Path(f"/proc/{worker._process.pid}/environ")
+        # Popen returns before the kernel has set up the new program: until then the file is empty.
+        while not (environment := shown.read_bytes()) and worker._process.poll() is None:
+            time.sleep(0.001)
+    assert b"PYTHONPATH=/of/the/user" in environment.split(b"\0")
 
 
 def test_what_the_second_process_cannot_draw_is_told_of(scene):
