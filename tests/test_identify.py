@@ -1,9 +1,11 @@
 """Initial motion, starting law and joint fit on trajectories simulated with a known law."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from cube import FPS, FRAMES, GRAVITY, OMEGA, UP, VELOCITY, scene, settings
+from cube import FPS, FRAMES, GRAVITY, OMEGA, UP, VELOCITY, VOLUME, Seen, scene, settings
 from scipy.spatial.transform import Rotation
 from small import SMALL
 
@@ -91,6 +93,23 @@ def test_no_starting_law_is_stiffer_than_a_motion_determines(seen):
     ]
     assert errors[0] < DIVERGED  # it could be simulated, and so could the stiffer one
     assert errors[1] == DIVERGED
+
+
+def test_starting_laws_are_compared_until_the_body_is_at_rest(seen):
+    """Rollouts of a motion, and of the same one after which the body lies still."""
+    trajectory, law = seen[0], ("jelly", "sticky", 3e4)
+    last = trajectory.positions[-1:]
+    still = Seen(np.concatenate([trajectory.positions, *[last] * 5]), np.arange(FRAMES + 5) / FPS, VOLUME)
+    creeps = still.positions.copy()
+    creeps[FRAMES:, :, 1] -= 0.02 * np.arange(1, 6)[:, None]
+    problems = [
+        FilmedBody(replace(scene(), frame_count=len(one.times)), one, SMALL, samples=2)
+        for one in (trajectory, still, Seen(creeps, still.times, VOLUME))
+    ]
+    assert [p.moving_frames for p in problems] == [FRAMES - 1, FRAMES - 1, FRAMES + 4]
+    motion = InitialState.of_world(problems[0].axes, VELOCITY, OMEGA)
+    short, rested, creeping = (objective_of_start(Objective(p, settings()), motion, *law) for p in problems)
+    assert short == rested != creeping
 
 
 def test_interrupted_identify_ends_with_the_same_numbers(seen, tmp_path):

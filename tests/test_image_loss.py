@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -9,9 +10,11 @@ import pytest
 import torch
 from ball import ball_scene, ball_terms
 
+from masiv.identification.losses import picture_window as windows_module
 from masiv.identification.losses.images import ImageTerms
 from masiv.identification.losses.picture_window import (
     PIXELS_A_PARTICLE,
+    PictureWindows,
     particle_spacing,
     picture_window,
     render_particles,
@@ -92,3 +95,44 @@ def test_large_pictures_are_averaged_down_to_what_the_particles_resolve(terms):
         assert float((window.image * window.mask[..., None]).mean((0, 1)).norm()) > 0
     assert best_scale(large) == pytest.approx(1.0, abs=0.021)
     assert error(large, 1.1) == pytest.approx(error(terms, 1.1), rel=0.1)
+
+
+def counted(scene, read):
+    """``scene`` without the frames that it has read. read: list to which each picture that is read is added."""
+
+    def load(view, frame):
+        read.append((view, frame))
+        return scene.load(view, frame)
+
+    return dataclasses.replace(scene, load=load)
+
+
+def same(one, other):
+    parts = ("image", "mask", "valid")
+    cameras_agree = np.array_equal(one.camera.intrinsics, other.camera.intrinsics)
+    return cameras_agree and all(torch.equal(getattr(one, n), getattr(other, n)) for n in parts)
+
+
+def test_windows_are_kept_and_travel_with_the_object(terms):
+    read = []
+    problem = ball_terms(counted(terms.problem.scene, read), 0.05).problem
+    windows, keys = PictureWindows(problem), [(view, frame) for view in problem.scene.views for frame in range(2)]
+    first = [windows(*key) for key in keys]
+    problem.scene.release_pictures()
+    assert all(same(window, picture_window(problem, *key)) for window, key in zip(first, keys, strict=True))
+    problem.scene.release_pictures()
+    before = len(read)
+    copied = copy.deepcopy(windows)
+    assert all(same(copied(*key), windows(*key)) for key in keys)
+    assert len(read) == before
+
+
+def test_windows_take_bounded_memory(terms, monkeypatch):
+    problem, made = terms.problem, []
+    one = PictureWindows(problem)(0, 0)
+    monkeypatch.setattr(windows_module, "MAX_BYTES", int(2.5 * one.nbytes))
+    monkeypatch.setattr(windows_module, "picture_window", lambda *given: made.append(given[1:]) or one)
+    windows = PictureWindows(problem)
+    for view in (0, 1, 0, 2, 0, 1):  # 2 drops 1, which was not used for the longest time
+        windows(view, 0)
+    assert made == [(0, 0), (1, 0), (2, 0), (1, 0)]

@@ -99,7 +99,7 @@ def test_particles_that_no_camera_sees_have_no_color(terms):
     assert known[depth < 0.02].mean() > 0.9
     assert not known[depth > 0.05].any()
     one_sided = ball_terms(dataclasses.replace(colored_scene(), hidden_views=tuple(range(1, 8))), 0.03)
-    known = estimate_particle_colors(one_sided.problem).channels[:, 2].numpy() > 0
+    known = estimate_particle_colors(one_sided.windows).channels[:, 2].numpy() > 0
     behind = (points - CENTRE) @ (problem.scene.cameras[0].centre - CENTRE) < -0.1
     assert not known[behind].any()
     assert known.any()

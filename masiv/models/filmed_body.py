@@ -20,6 +20,9 @@ from masiv.observations.motion import Observed
 from masiv.scene.scene import Scene
 from masiv.scene.transforms import SimulationFrame
 
+REST_CELLS = 0.1
+"""A body whose particles are this close to where they end, on average, is at rest [grid cells]. Chosen: a grid does
+not resolve movements that are so small."""
 OUTERMOST = 0.9
 """Quantile of the particles' distances from their middle that is half of the body's size."""
 
@@ -98,6 +101,13 @@ class FilmedBody:
     def spacing(self) -> float:
         """Of the grid [m]."""
         return self.body.spacing
+
+    @property
+    def moving_frames(self) -> int:
+        """Frames until the observed body is at rest for good; all ``frames`` if it still moves in the last one."""
+        distance = (self.targets - self.targets[-1]).norm(dim=2).mean(1)
+        moving = torch.nonzero(distance > REST_CELLS * self.spacing)
+        return min(-(-(int(moving.max()) + 2) // self.samples), self.frames) if len(moving) > 0 else self.frames
 
     def substeps(self, law: Law, effects: ActiveEffects | None = None) -> int:
         """Substeps in a frame for ``law`` with ``effects`` (``known`` if None); a multiple of 8, so that a law that

@@ -14,8 +14,8 @@ from scipy.optimize import brentq
 from masiv.identification.losses.particle_colors import ParticleColors, color_correlation_loss, estimate_particle_colors
 from masiv.identification.losses.picture_window import (
     PictureWindow,
+    PictureWindows,
     particle_spacing,
-    picture_window,
     render_particles,
     to_world,
 )
@@ -35,6 +35,7 @@ class ImageTerms:
     def __init__(self, problem: FilmedBody, *, with_colors: bool) -> None:
         self.problem = problem
         self.with_colors = with_colors
+        self.windows = PictureWindows(problem)
 
     @functools.cached_property
     def splat_sigma(self) -> float:
@@ -52,7 +53,7 @@ class ImageTerms:
         def relative_excess(size: float) -> float:
             total = 0.0
             for view in self.problem.scene.views:
-                window = picture_window(self.problem, view, 0)
+                window = self.windows(view, 0)
                 difference, area = _alpha_difference(render_particles(window, points, size * spacing, nothing), window)
                 total += float(difference.sum()) / area
             return total
@@ -65,11 +66,14 @@ class ImageTerms:
     @functools.cached_property
     def colors(self) -> ParticleColors | None:
         """The particles' colors; None without pictures or if colors are not compared."""
-        return estimate_particle_colors(self.problem) if self.with_colors and self.problem.scene.views else None
+        return estimate_particle_colors(self.windows) if self.with_colors and self.problem.scene.views else None
 
-    def prepare(self) -> None:
-        """Compute now what would be computed on first use: copies of this object then share it."""
+    def prepare(self, pictures: Iterable[tuple[int, int]]) -> None:
+        """Compute now what would be computed on first use, also for ``pictures``: copies of this object then have it,
+        and need not read those pictures."""
         _ = self.splat_sigma, self.colors
+        for frame, view in pictures:
+            self.windows(view, frame)
 
     def errors(self, positions: torch.Tensor, pictures: Iterable[tuple[int, int]]) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean silhouette error () and mean color error () over ``pictures``, as ``errors_by_picture``."""
@@ -104,7 +108,7 @@ class ImageTerms:
         problem, colors = self.problem, self.colors
         nothing = torch.zeros(problem.count, 3)
         for frame, view in pictures:
-            window = picture_window(problem, view, frame)
+            window = self.windows(view, frame)
             points = to_world(problem, positions[frame * problem.samples - 1])
             difference, area = _alpha_difference(render_particles(window, points, self.splat_sigma, nothing), window)
             yield (

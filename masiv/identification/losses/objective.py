@@ -99,12 +99,17 @@ class Objective:
         geometry = self.config.trajectory_weight * geometry_error / self.problem.size
         return geometry + self.image_loss(image_errors)
 
+    def prepare(self, frames: int) -> None:
+        """Compute now what ``evaluate`` of ``frames`` frames needs of the pictures: copies of this object have it."""
+        if self.compares_images:
+            self.images.prepare(pictures_of_each_frame(self.problem.scene.views, frames))
+
     @torch.no_grad()
     def evaluate(self, positions: torch.Tensor) -> float:
-        """J of ``positions`` (K, N, 3) [m, simulation frame] over all frames, each time with the same pictures."""
+        """J of ``positions`` (K, N, 3) [m, simulation frame] over their frames, each time with the same pictures."""
         value = self.config.trajectory_weight * self.geometry_error(positions) / self.problem.size
         if self.compares_images:
-            pictures = pictures_of_each_frame(self.problem.scene.views, self.problem.frames)
+            pictures = pictures_of_each_frame(self.problem.scene.views, len(positions) // self.problem.samples)
             value = value + self.image_loss(self.images.errors(positions, pictures))
         return float(value)
 

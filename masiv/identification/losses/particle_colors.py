@@ -14,12 +14,11 @@ import torch
 
 from masiv.identification.losses.picture_window import (
     PictureWindow,
+    PictureWindows,
     particle_spacing,
-    picture_window,
     render_particles,
     to_world,
 )
-from masiv.models.filmed_body import FilmedBody
 
 SIRT_SWEEPS = 12
 COLOR_SPLAT_SIGMA = 0.5
@@ -49,20 +48,21 @@ class ParticleColors:
 
 
 @torch.enable_grad()
-def estimate_particle_colors(problem: FilmedBody) -> ParticleColors:
-    """The colors of the particles of ``problem`` from all pictures of frame 0.
+def estimate_particle_colors(windows: PictureWindows) -> ParticleColors:
+    """The colors of the particles of ``windows.problem`` from all pictures of frame 0.
 
     A picture is linear in the colors. They are solved for by simultaneous back-projection (SIRT, Gilbert 1972): in each
     sweep a particle's color changes by the mean residual of the pixels to which it contributes.
     """
+    problem = windows.problem
     count, sigma = problem.count, COLOR_SPLAT_SIGMA * particle_spacing(problem)
     points = to_world(problem, problem.particles)
-    windows = [picture_window(problem, view, 0) for view in problem.scene.views]
+    seen = [windows(view, 0) for view in problem.scene.views]
     colors = torch.full((count, 3), 0.5, requires_grad=True)
     weight = torch.zeros(count)
     for sweep in range(SIRT_SWEEPS):
         correction = torch.zeros(count, 3)
-        for window in windows:
+        for window in seen:
             picture = render_particles(window, points, sigma, colors)
             inside = (window.mask * window.valid)[..., None]
             if sweep == 0:

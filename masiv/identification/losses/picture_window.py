@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import cv2
@@ -19,6 +20,8 @@ PARTICLE_OPACITY = 0.9
 PIXELS_A_PARTICLE = 4
 """Pixels along the spacing of the particles that silhouettes and colors of particles are compared with, at most: the
 standard deviation of a particle's Gaussian is a tenth of the spacing or more. Chosen, as ``PIXELS_A_VOXEL``."""
+MAX_BYTES = 1 << 26
+"""Of the windows that are kept for one recording [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,37 @@ class PictureWindow:
     image: torch.Tensor
     mask: torch.Tensor
     valid: torch.Tensor
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the tensors [bytes]."""
+        return self.image.nbytes + self.mask.nbytes + self.valid.nbytes
+
+
+class PictureWindows:
+    """``picture_window(problem, view, frame)``, with the windows used last, at most ``MAX_BYTES``.
+
+    A window has as many pixels as the particles resolve, so it is small where a picture is large: a search compares
+    each of its rollouts with the same pictures. The windows are pickled with the object.
+    """
+
+    def __init__(self, problem: FilmedBody) -> None:
+        self.problem = problem
+        self._windows: OrderedDict[tuple[int, int], PictureWindow] = OrderedDict()
+        self._bytes = 0
+
+    def __call__(self, view: int, frame: int) -> PictureWindow:
+        """The window, made again if it was dropped."""
+        key = view, frame
+        if key in self._windows:
+            self._windows.move_to_end(key)
+            return self._windows[key]
+        found = picture_window(self.problem, view, frame)
+        self._windows[key] = found
+        self._bytes += found.nbytes
+        while self._bytes > MAX_BYTES and len(self._windows) > 1:
+            self._bytes -= self._windows.popitem(last=False)[1].nbytes
+        return found
 
 
 def picture_window(problem: FilmedBody, view: int, frame: int) -> PictureWindow:
@@ -62,7 +96,8 @@ def picture_window(problem: FilmedBody, view: int, frame: int) -> PictureWindow:
         )
         valid = valid > 1 - 1e-4
     pixels = torch.as_tensor(image.astype(np.float32) / 255)
-    return PictureWindow(camera, pixels, torch.as_tensor(mask), torch.as_tensor(valid))
+    # Copies of what is cropped: a view of it would keep the whole picture in memory.
+    return PictureWindow(camera, pixels, torch.as_tensor(mask).contiguous(), torch.as_tensor(valid).contiguous())
 
 
 def _reduction(problem: FilmedBody, camera: Camera) -> int:

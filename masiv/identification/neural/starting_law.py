@@ -91,16 +91,15 @@ def choose_starting_laws(
     """Starting laws, best first.
 
     Each material is tried at each of ``START_MODULI``. The contact and the scales of the best materials are searched.
-    objective: of a problem with few particles. Rollouts run in parallel in ``workers``; the number of processes
-    changes no bit of the result. Raises MasivError if every rollout diverges.
+    Rollouts end when the observed body is at rest. objective: of a problem with few particles. Rollouts run in parallel
+    in ``workers``; the number of processes changes no bit of the result. Raises MasivError if every rollout diverges.
     """
     config, workers = objective.config, workers or Workers()
     materials = [*MATERIALS, MAXWELL_FLUID] if config.start == "auto" else [config.start]
     contacts = ["sticky", "release"] if config.contact == "auto" else [config.contact]
     if objective.problem.scene.ground is None:
         contacts = ["none"]
-    if objective.compares_images:
-        objective.images.prepare()  # once, here: each process has a copy of its own
+    objective.prepare(objective.problem.moving_frames)  # once, here: each task has a copy of its own
     best = _best_moduli(objective, initial_state, materials, contacts[0], progress, workers)
     ranked = sorted(best, key=lambda name: best[name])[:SEARCHED_MATERIALS]
     slowest_first = sorted(ranked, key=lambda name: -search_cost(name, best[name][1]))
@@ -218,7 +217,7 @@ def objective_of_start(
     if law.wave_modulus() > MAX_START_MODULUS * problem.scene.density / 1000:
         return DIVERGED
     try:
-        return objective.evaluate(problem.run(law, initial_state, contact, problem.frames))
+        return objective.evaluate(problem.run(law, initial_state, contact, problem.moving_frames))
     except InputError:
         raise
     except MasivError:  # it diverges, or is too stiff for any substep
