@@ -101,7 +101,7 @@ def test_starting_laws_are_compared_until_the_body_is_at_rest(seen):
     last = trajectory.positions[-1:]
     still = Seen(np.concatenate([trajectory.positions, *[last] * 5]), np.arange(FRAMES + 5) / FPS, VOLUME)
     creeps = still.positions.copy()
-    creeps[FRAMES:, :, 1] -= 0.02 * np.arange(1, 6)[:, None]
+    creeps[FRAMES:, :, 1] -= 0.04 * np.arange(1, 6)[:, None]
     problems = [
         FilmedBody(replace(scene(), frame_count=len(one.times)), one, SMALL, samples=2)
         for one in (trajectory, still, Seen(creeps, still.times, VOLUME))

@@ -21,8 +21,8 @@ from masiv.scene.scene import Scene
 from masiv.scene.transforms import SimulationFrame
 
 REST_CELLS = 0.1
-"""A body whose particles are this close to where they end, on average, is at rest [grid cells]. Chosen: a grid does
-not resolve movements that are so small."""
+"""A body is at rest if its particles are, on average, this close to their mean places from then on [grid cells].
+Chosen: a grid does not resolve movements that are so small."""
 OUTERMOST = 0.9
 """Quantile of the particles' distances from their middle that is half of the body's size."""
 
@@ -105,7 +105,9 @@ class FilmedBody:
     @property
     def moving_frames(self) -> int:
         """Frames until the observed body is at rest for good; all ``frames`` if it still moves in the last one."""
-        distance = (self.targets - self.targets[-1]).norm(dim=2).mean(1)
+        remaining = torch.arange(len(self.targets), 0, -1)[:, None, None]
+        mean_from_then = self.targets.flip(0).cumsum(0).flip(0) / remaining
+        distance = (self.targets - mean_from_then).norm(dim=2).mean(1)
         moving = torch.nonzero(distance > REST_CELLS * self.spacing)
         return min(-(-(int(moving.max()) + 2) // self.samples), self.frames) if len(moving) > 0 else self.frames
 
