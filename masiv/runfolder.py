@@ -84,8 +84,16 @@ class RunFolder:
         return cls(path, _with_paths(record, lambda other: str((path.resolve() / other).resolve())))
 
     @classmethod
+    def begun_in(cls, path: Path) -> RunFolder | None:
+        """The run in ``path``; None if there is none, or if no stage of it has begun: it was refused, and what it was
+        asked does not count. Raises InputError."""
+        run = cls.open(path) if (path / "run.yaml").is_file() else None
+        return run if run is not None and run.any_begun else None
+
+    @classmethod
     def create_or_resume(cls, path: Path, request: Request) -> RunFolder:
-        """A new run, or an existing one that was asked the same. Raises InputError saying what differs."""
+        """A new run, or an existing one that was asked the same. Raises InputError saying what differs from what the
+        stages that have begun were asked."""
         known = (path / "run.yaml").is_file()
         if not known and path.exists() and not _is_empty(path):
             raise InputError(f"{path} exists and is not a run folder: give another one with --out")
@@ -110,9 +118,11 @@ class RunFolder:
 
     def accept(self, request: Request) -> None:
         """Record ``request``. Raises InputError if the run was asked something else, and says what differs."""
-        self.check(request)
         asked = _new_record(request)
-        self.record |= {key: asked[key] for key in ("schema", "config", "scene", "versions")}
+        if self.any_begun:
+            self.check(request)
+            asked = {key: asked[key] for key in ("schema", "config", "scene", "versions")}
+        self.record |= asked
         self._write()
 
     # -- names --------------------------------------------------------------------------------------------------
@@ -226,6 +236,11 @@ class RunFolder:
         return {name: state["seconds"] for name, state in self.record["stages"].items() if state["state"] == DONE}
 
     # -- the record ---------------------------------------------------------------------------------------------
+
+    @property
+    def any_begun(self) -> bool:
+        """Whether a stage has begun."""
+        return any(map(self._begun, STAGES))
 
     def _begun(self, stage: str) -> bool:
         return self.record["stages"][stage]["state"] != PENDING

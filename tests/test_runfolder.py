@@ -92,6 +92,22 @@ def test_settings_of_a_stage_not_begun_may_change(tmp_path):
     assert RunFolder.open(path).done("reconstruct")
 
 
+def test_what_a_refused_run_was_asked_does_not_count(tmp_path):
+    path = tmp_path / "run"
+    RunFolder.create_or_resume(path, request(tmp_path, reconstruct__iterations=7))
+    assert RunFolder.begun_in(path) is None
+    other = request(tmp_path, scene={**SCENE, "fps": 30.0}, fit_frames=10, reconstruct__iterations=8)
+    run = RunFolder.create_or_resume(path, other)
+    assert RunFolder.open(path).record == run.record
+    assert (run.fit_frames, run.record["scene"]["fps"], run.config["reconstruct"]["iterations"]) == (10, 30.0, 8)
+    with run.stage("reconstruct"):
+        pass
+    begun = RunFolder.begun_in(path)
+    assert begun is not None
+    assert begun.record == run.record
+    assert RunFolder.begun_in(tmp_path / "none") is None
+
+
 def test_a_run_made_before_a_key_existed_opens(tmp_path):
     """The missing key had what is the default today; asking for another value is another request."""
     path = tmp_path / "run"

@@ -70,7 +70,7 @@ class TracksRun(Run):
     def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> TracksRun:
         """As ``Run.open``. The law is ``auto`` if none is named, since markers cannot teach a neural one."""
         refuse(request, NOT_REQUESTED_OF_TRACKS, "pictures", scene)
-        existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
+        existing = RunFolder.begun_in(out)
         given = given_settings(overrides.config, overrides.assignments).get("identify")
         named = isinstance(given, dict) and "law" in given
         law = request.identify.get("law")

@@ -67,7 +67,7 @@ class VideoRun(Run):
 
     @classmethod
     def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> VideoRun:
-        existing = RunFolder.open(out) if (out / "run.yaml").is_file() else None
+        existing = RunFolder.begun_in(out)
         flags: dict[str, Any] = {f"identify.{key}": value for key, value in request.identify.items()}
         flags["reconstruct.refine_calibration"] = False if request.keep_calibration else None
         config = settings(overrides, existing.config if existing else None, **flags)
