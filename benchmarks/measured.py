@@ -4,7 +4,8 @@
     python benchmarks/measured.py balls [--json FILE]
     python benchmarks/measured.py damping --particles 400 1000 1728 --youngs 310e3 --viscosity 250
     python benchmarks/measured.py load --youngs 306.4e3 --viscosity 203
-    python benchmarks/measured.py creep --duration 3.5 --particles 400 [--held-straight]
+    python benchmarks/measured.py creep --duration 3.5 --particles 400 [--held-straight] [--fractions 0.1 0.2]
+                                        [--effects point_mass hung_mass]
 
 The measurements are in the folder that MASIV_MEASURED names, ../shared/measured beside the repository by default. They
 are public: see benchmarks/measured.md.
@@ -19,6 +20,7 @@ import math
 import os
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
@@ -246,11 +248,20 @@ def load(source: Path, youngs: float, viscosity: float, particles: int, courant:
     return rows
 
 
-def creep(source: Path, particles: int, courant: float, duration: float, youngs: float, held_straight: bool) -> dict:
-    """Law with Maxwell branches from gravity_a alone, over ``duration`` [s] after its release, from two starts with
-    the modulus ``youngs`` [Pa] at the frequency of its swing; with it, the mass in the middle of the end of the loaded
-    beam, or on a thread from there, from load52_a. gravity_b and load52_b are held out. moduli: of uniaxial
-    tension, three times those of shear."""
+def creep(
+    source: Path,
+    particles: int,
+    courant: float,
+    duration: float,
+    youngs: float,
+    held_straight: bool,
+    fractions: Sequence[float],
+    effects: Sequence[str],
+) -> dict:
+    """Law with Maxwell branches from gravity_a alone, over ``duration`` [s] after its release, with ``fractions`` of
+    the branches to start from and the modulus ``youngs`` [Pa] at the frequency of its swing; with the best one, each
+    of ``effects``, tied to the middle of the end of the loaded beam, from load52_a. gravity_b and load52_b are held
+    out. moduli: of uniaxial tension, three times those of shear."""
     import torch
 
     from masiv.effects.relaxation import BRANCHES, TIMES, shear_moduli
@@ -282,7 +293,7 @@ def creep(source: Path, particles: int, courant: float, duration: float, youngs:
 
     fits, rows = [], []
     swing = 2 * math.pi * 7.77  # of gravity_a [rad/s], at which the law alone has the modulus ``youngs``
-    for fraction in (0.1, 0.2):
+    for fraction in fractions:
         began = time.perf_counter()
         simulation = clamped_body_model(tracks, "", settings, config, known=known)
         start = dict(zip(names, [fraction] * BRANCHES + list(TIMES), strict=True))
@@ -300,7 +311,8 @@ def creep(source: Path, particles: int, courant: float, duration: float, youngs:
 
     given = known | {n: law.values[n] for n in ("youngs_modulus", *names)}
     loads = {}
-    for name, start in (("point_mass", {}), ("hung_mass", {"hung_mass.length": THREAD})):
+    for name in effects:
+        start = {"hung_mass.length": THREAD} if name == "hung_mass" else {}
         began = time.perf_counter()
         simulation = clamped_body_model(tracks, "load52", settings, config, known=given)
         place = max(simulation.term(name).guesses, key=lambda guess: guess[2])  # along the body, from the clamp
@@ -329,7 +341,8 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=0.6, help="[s]")
     parser.add_argument("--courant", type=float, default=0.6)
     parser.add_argument("--held-straight", action="store_true", help="of creep: the shape before the release is known")
-    parser.add_argument("--effects", nargs="+", default=["point_mass", "point_force"], help="of load")
+    parser.add_argument("--fractions", type=float, nargs="+", default=[0.1, 0.2], help="of creep: starts of its fit")
+    parser.add_argument("--effects", nargs="+", help="of load and creep")
     asked = parser.parse_args()
     source = data_folder()
     if not source.is_dir():
@@ -351,8 +364,9 @@ def main() -> None:
         )
     elif asked.what == "load":
         found = load(
-            source / "silicone_beam", asked.youngs, asked.viscosity, asked.particles[0], asked.courant, asked.effects
-        )
+            source / "silicone_beam", asked.youngs, asked.viscosity, asked.particles[0], asked.courant,
+            asked.effects or ["point_mass", "point_force"],
+        )  # fmt: skip
     elif asked.what == "creep":
         found = creep(
             source / "silicone_beam",
@@ -361,6 +375,8 @@ def main() -> None:
             asked.duration,
             asked.youngs,
             asked.held_straight,
+            asked.fractions,
+            asked.effects or ["point_mass", "hung_mass"],
         )
     else:
         found = balls(source / "ball_drops")
