@@ -16,6 +16,7 @@ from masiv.identification.neural.starting_law import (
     DIVERGED,
     MAX_START_MODULUS,
     StartingLaw,
+    choose_starting_laws,
     objective_of_start,
     rank_starting_laws,
 )
@@ -24,6 +25,7 @@ from masiv.materials.load import load_law
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState, estimate_initial_motion
 from masiv.pretraining.pretrain import pretrained_path
+from masiv.progress import silent
 from masiv.scene.scene import Ground
 from masiv.simulation.simulate import simulate
 from masiv.simulation.subdivide import merge_subparticles
@@ -110,6 +112,26 @@ def test_starting_laws_are_compared_until_the_body_is_at_rest(seen):
     motion = InitialState.of_world(problems[0].axes, VELOCITY, OMEGA)
     short, rested, creeping = (objective_of_start(Objective(p, settings()), motion, *law) for p in problems)
     assert short == rested != creeping
+
+
+def test_an_interrupted_search_for_the_starting_law_goes_on(seen, tmp_path, monkeypatch):
+    class Stop(Exception):
+        pass
+
+    def stop(*_):
+        raise Stop
+
+    monkeypatch.setattr("masiv.identification.neural.starting_law.START_MODULI", (1e4, 3e4))
+    problem = FilmedBody(scene(), seen[0], SMALL, samples=2, chosen=np.arange(0, len(seen[0].positions[0]), 4))
+    given = Objective(problem, settings()), InitialState.of_world(problem.axes, VELOCITY, OMEGA)
+    (whole,) = choose_starting_laws(*given, silent)
+    checkpoint, heard = Checkpoint(tmp_path / "identify.pt"), []
+    with pytest.raises(Stop):
+        choose_starting_laws(*given, stop, None, checkpoint)
+    (resumed,) = choose_starting_laws(*given, lambda *told: heard.append(told), None, checkpoint)
+    assert [told[1:3] for told in heard] == [(1, 1)]  # of the scales: the moduli were known
+    assert resumed.objective == whole.objective
+    assert all(torch.equal(value, resumed.law.state_dict()[name]) for name, value in whole.law.state_dict().items())
 
 
 def test_interrupted_identify_ends_with_the_same_numbers(seen, tmp_path):

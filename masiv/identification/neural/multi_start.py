@@ -51,7 +51,8 @@ def fit_neural_law(
     else:
         with workers_for(config.processes, config.scheduler, "identify.processes") as workers:
             workers.start()
-            starts = _starts_to_fit(choose_starting_laws(coarse(), recordings[0].initial_state, progress, workers))
+            chosen = choose_starting_laws(coarse(), recordings[0].initial_state, progress, workers, checkpoint)
+            starts = _starts_to_fit(chosen)
     nested = NestedCheckpoint(checkpoint, {"starts": [start.state() for start in starts]})
     if "starts" not in saved:
         nested.save({})

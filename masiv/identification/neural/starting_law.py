@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
+from masiv.checkpoint import Checkpoint
 from masiv.errors import InputError, MasivError
 from masiv.identification.losses.objective import Objective
 from masiv.materials.load import load_law
@@ -86,51 +87,53 @@ def with_scales(law: NeuralLaw, modulus: float, log_factors: Sequence[float] = (
 
 
 def choose_starting_laws(
-    objective: Objective, initial_state: InitialState, progress: Progress, workers: Workers | None = None
+    objective: Objective,
+    initial_state: InitialState,
+    progress: Progress,
+    workers: Workers | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> list[StartingLaw]:
     """Starting laws, best first.
 
     Each material is tried at each of ``START_MODULI``. The contact and the scales of the best materials are searched.
     Rollouts end when the observed body is at rest. objective: of a problem with few particles. Rollouts run in parallel
-    in ``workers``; the number of processes changes no bit of the result. Raises MasivError if every rollout diverges.
+    in ``workers``; the number of processes changes no bit of the result. checkpoint: keeps what is known of each
+    material. Raises MasivError if every rollout diverges.
     """
-    config, workers = objective.config, workers or Workers()
+    config, workers, checkpoint = objective.config, workers or Workers(), checkpoint or Checkpoint(None)
     materials = [*MATERIALS, MAXWELL_FLUID] if config.start == "auto" else [config.start]
     contacts = ["sticky", "release"] if config.contact == "auto" else [config.contact]
     if objective.problem.scene.ground is None:
         contacts = ["none"]
     objective.prepare(objective.problem.moving_frames)  # once, here: each task has a copy of its own
-    best = _best_moduli(objective, initial_state, materials, contacts[0], progress, workers)
-    ranked = sorted(best, key=lambda name: best[name])[:SEARCHED_MATERIALS]
-    slowest_first = sorted(ranked, key=lambda name: -search_cost(name, best[name][1]))
-    tasks = [(name, contacts, *best[name]) for name in slowest_first]
-    results = map(unwrap, workers.map(_search_scales, tasks, shared=(objective, initial_state)))
-    starts = {}
-    for done, (name, (contact, log_factors, error)) in enumerate(zip(slowest_first, results, strict=True)):
-        starts[name] = StartingLaw(name, contact, with_scales(_law(name), best[name][1], log_factors), error)
-        progress("identify: start", done + 1, len(ranked), f"{name}, {contact}: {_note(error)}")
-    return rank_starting_laws([starts[name] for name in ranked])
+    known: dict[str, dict[str, Any]] = checkpoint.load() or {}
+    best, searched = known.setdefault("best_moduli", {}), known.setdefault("searched", {})
 
+    def keep(found: dict[str, Any], name: str, result: Any, count: int, contact: str, error: float) -> None:
+        found[name] = result
+        checkpoint.save(known)
+        progress("identify: start", len(found), count, f"{name}, {contact}: {_note(error)}")
 
-def _best_moduli(
-    objective: Objective,
-    initial_state: InitialState,
-    materials: Sequence[str],
-    contact: str,
-    progress: Progress,
-    workers: Workers,
-) -> dict[str, tuple[float, float]]:
-    """The least objective () of each material, and its modulus [Pa]. Raises MasivError if every rollout diverges."""
+    shared = objective, initial_state
     moduli = [modulus * objective.problem.scene.density / 1000 for modulus in START_MODULI]
-    tasks = [(name, contact, moduli) for name in materials]
-    results = map(unwrap, workers.map(_objectives_of_moduli, tasks, shared=(objective, initial_state)))
-    best: dict[str, tuple[float, float]] = {}
-    for done, (name, errors) in enumerate(zip(materials, results, strict=True)):
-        best[name] = min(zip(errors, moduli, strict=True))
-        progress("identify: start", done + 1, len(materials), f"{name}, {contact}: {_note(best[name][0])}")
+    open_tasks = [(name, contacts[0], moduli) for name in materials if name not in best]
+    results = map(unwrap, workers.map(_best_modulus, open_tasks, shared=shared))
+    for (name, contact, _), result in zip(open_tasks, results, strict=True):
+        keep(best, name, result, len(materials), contact, result[0])
     if min(best.values())[0] >= DIVERGED:
         raise MasivError("identify: every starting law diverges; check the scene's ground, gravity and units")
-    return best
+
+    ranked = sorted(materials, key=lambda name: best[name])[:SEARCHED_MATERIALS]
+    slowest_first = sorted(ranked, key=lambda name: -search_cost(name, best[name][1]))
+    tasks = [(name, contacts, *best[name]) for name in slowest_first if name not in searched]
+    results = map(unwrap, workers.map(_search_scales, tasks, shared=shared))
+    for (name, *_), result in zip(tasks, results, strict=True):
+        keep(searched, name, result, len(ranked), result[0], result[2])
+    starts = []
+    for name in ranked:
+        contact, log_factors, error = searched[name]
+        starts.append(StartingLaw(name, contact, with_scales(_law(name), best[name][1], log_factors), error))
+    return rank_starting_laws(starts)
 
 
 def rank_starting_laws(starts: Sequence[StartingLaw]) -> list[StartingLaw]:
@@ -143,11 +146,11 @@ def _note(error: float) -> str:
     return "diverges" if error >= DIVERGED else f"objective {error:.3f}"
 
 
-def _objectives_of_moduli(
+def _best_modulus(
     objective: Objective, initial_state: InitialState, name: str, contact: str, moduli: Sequence[float]
-) -> list[float]:
-    """One task for several moduli: another process reads the pictures again for each task."""
-    return [objective_of_start(objective, initial_state, name, contact, modulus) for modulus in moduli]
+) -> tuple[float, float]:
+    """The least objective () of a material at ``moduli`` [Pa], and its modulus."""
+    return min((objective_of_start(objective, initial_state, name, contact, modulus), modulus) for modulus in moduli)
 
 
 def _search_scales(
