@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from masiv.config import Config
 from masiv.errors import InputError
 from masiv.identification.config import IdentifyConfig
+from masiv.identification.losses.picture_window import MAX_BYTES as WINDOWS_BYTES
 from masiv.memory import available_bytes, taken_bytes
 from masiv.models.deformable import DeformableBody
 from masiv.models.marked_body import MAX_SUBSTEPS
 from masiv.mpm.simulator import SUBSTEPS_UNIT, kernels_bytes
 from masiv.progress import Progress
-from masiv.scene.frame_cache import MAX_BYTES
+from masiv.scene.frame_cache import MAX_BYTES, MAX_BYTES_OF_WORKER
 from masiv.scene.scene import Scene
 from masiv.workers import process_count
 
@@ -95,7 +96,7 @@ def expected_memory(stage: str, scene: Scene, config: Config, particles: int | N
     elif stage == "trajectory":
         parts = [_pictures(stage, scene)]
     elif stage == "identify":
-        parts = [*_identify(config, count), _pictures(stage, scene)]
+        parts = [*_identify(config, count, _pictures_of_worker_mb(scene)), _pictures(stage, scene)]
     else:
         parts = _refine(config, count)
     return ExpectedMemory(stage, (MemoryPart("the process", MAIN_MB[stage], ""), *parts))
@@ -119,19 +120,37 @@ def _second_process(config: Config) -> list[MemoryPart]:
 def _pictures(stage: str, scene: Scene) -> MemoryPart:
     if scene.load_cloud is not None:
         return MemoryPart("point clouds", 0.0, "")
-    pixels = [scene.cameras[view].width * scene.cameras[view].height for view in scene.views]
+    every = _all_pictures_bytes(scene)
+    kept = min(MAX_BYTES, every) + (min(WINDOWS_BYTES, every) if stage == "identify" else 0)
+    return MemoryPart("pictures", (kept + BYTES_READ_A_PIXEL[stage] * _pixels(scene)) / 1e6, "smaller pictures")
+
+
+def _pixels(scene: Scene) -> int:
+    """Of all pictures of one frame."""
+    return sum(scene.cameras[view].width * scene.cameras[view].height for view in scene.views)
+
+
+def _all_pictures_bytes(scene: Scene) -> int:
+    """Memory of all pictures of ``scene``, if it were kept."""
     a_pixel = BYTES_A_PIXEL + (BYTES_A_DEPTH if scene.depth_noise is not None else 0)
-    kept = min(MAX_BYTES, a_pixel * scene.frame_count * sum(pixels))
-    return MemoryPart("pictures", (kept + BYTES_READ_A_PIXEL[stage] * sum(pixels)) / 1e6, "smaller pictures")
+    return a_pixel * scene.frame_count * _pixels(scene)
 
 
-def _identify(config: Config, count: int) -> list[MemoryPart]:
+def _pictures_of_worker_mb(scene: Scene) -> float:
+    """What a further process of identify keeps of pictures and their windows [MB]."""
+    every = 0 if scene.load_cloud is not None else _all_pictures_bytes(scene)
+    return (min(MAX_BYTES_OF_WORKER, every) + min(WINDOWS_BYTES, every)) / 1e6
+
+
+def _identify(config: Config, count: int, pictures: float) -> list[MemoryPart]:
+    """pictures [MB]: of each process beside the first."""
     identify = config.identify
     if identify.law == "springs":  # its rollouts keep their states elsewhere, within the same bound
         return _simulating(config.simulator.memory_mb, 0.0, "")
     search, whole = (_capacity_mb(n, config) for n in (min(count, identify.search_particles), count))
     processes = 1 if identify.scheduler else process_count(identify.processes)
-    return _simulating(*max(_states(identify, processes, search, whole), key=sum), "identify.processes=1")
+    phases = _states(identify, processes, search, whole, pictures)
+    return _simulating(*max(phases, key=sum), "identify.processes=1")
 
 
 def _refine(config: Config, count: int) -> list[MemoryPart]:
@@ -151,17 +170,21 @@ def _simulating(states: float, others: float, less_with: str) -> list[MemoryPart
     return [*parts, MemoryPart("further processes", others, less_with)] if others else parts
 
 
-def _states(identify: IdentifyConfig, processes: int, search: float, whole: float) -> list[tuple[float, float]]:
+def _states(
+    identify: IdentifyConfig, processes: int, search: float, whole: float, pictures: float
+) -> list[tuple[float, float]]:
     """Of the search for laws with few particles and of the fits with all: what simulators reserve, and what processes
-    beside the first take without that [MB]. search, whole: a simulator of few particles, and of all."""
+    beside the first take without that [MB]. search, whole: a simulator of few particles, and of all; pictures: of each
+    process beside the first."""
     both = whole if whole == search else whole + search  # one process keeps both: Taichi frees nothing
     if identify.law == "neural":
         if identify.scheduler:
             return [(whole, 0.0)]
         if processes > 1:
-            return [(processes * search, processes * SEARCH_PROCESS_MB), (2 * whole, FIT_PROCESS_MB)]
+            searching = processes * search, processes * (SEARCH_PROCESS_MB + pictures)
+            return [searching, (2 * whole, FIT_PROCESS_MB + pictures)]
     if identify.law == "auto" and processes > 1:
-        return [((processes + 1) * search, processes * SEARCH_PROCESS_MB), (both, 0.0)]
+        return [((processes + 1) * search, processes * (SEARCH_PROCESS_MB + pictures)), (both, 0.0)]
     return [(both, 0.0)]
 
 
