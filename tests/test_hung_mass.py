@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from masiv.effects.active import ActiveEffects
 from masiv.effects.boundary.clamp import with_clamp
 from masiv.effects.catalogue import effects
-from masiv.effects.places import weights_around
+from masiv.effects.places import tied_weights, weights_around
 from masiv.errors import InputError, MasivError
 from masiv.models.initial_state import rigid_initial_state
 from masiv.mpm.rollout import rollout
@@ -116,6 +116,46 @@ def test_it_bobs_like_a_fixed_mass_and_swings_like_a_weight_without_inertia():
     swing = np.ptp(weight[:, 0])
     assert np.abs(hung[:, 0] - weight[:, 0]).max() < 0.1 * swing
     assert np.abs(fixed[:, 0] - weight[:, 0]).max() > 0.3 * swing
+
+
+@pytest.mark.parametrize("place", [(0.1, 5.1, 0.1), (0.21, 5.1, 0.1), (0.1, 4.98, 0.1)])
+def test_weights_of_a_tie_have_its_place_as_their_mean(place):
+    """Also at a face, where no weights that are positive do."""
+    x, place = body(height=5.0), torch.tensor(place, dtype=F64)
+    tied, around = (weights(x, place, 0.2 / 8) for weights in (tied_weights, weights_around))
+    assert tied.sum().item() == pytest.approx(1, abs=1e-9)
+    torch.testing.assert_close((tied[:, None] * x).sum(0), place, rtol=0, atol=1e-6)
+    off = float(((around[:, None] * x).sum(0) - place).norm())
+    inside = bool((place < x.max(0).values).all() and (place > x.min(0).values).all())
+    assert (off < 1e-3) == inside
+
+
+def test_points_in_a_plane_can_be_tied_to():
+    x = body(height=5.0)
+    x[:, 2] = 0.1
+    place = torch.tensor([0.2, 5.1, 0.1], dtype=F64)
+    tied = tied_weights(x, place, 0.2 / 8)
+    torch.testing.assert_close((tied[:, None] * x).sum(0), place, rtol=0, atol=1e-6)
+
+
+def test_it_hangs_from_where_it_is_said_to_hang():
+    """Guesses are the centres of the faces of the matter: a particle's cell ends half a spacing outside of it."""
+    axis = (torch.arange(8, dtype=F64) + 0.5) / 8 * 0.2
+    x = torch.cartesian_prod(axis, axis + 5.0, axis)
+    guesses = effects()["hung_mass"].hints.guesses(setting(x))
+    faces = {tuple(round(c, 4) for c in guess[:3]) for guess in guesses}
+    assert faces == {
+        (0.0, 5.1, 0.1),
+        (0.2, 5.1, 0.1),
+        (0.1, 5.0, 0.1),
+        (0.1, 5.2, 0.1),
+        (0.1, 5.1, 0.0),
+        (0.1, 5.1, 0.2),
+    }
+    place = (0.2, 5.1, 0.1)
+    taken = run(x, active(x, 1.0, 0.3, place, held_above=0.0), 1)
+    hung = torch.tensor(place, dtype=F64) - torch.tensor([0.0, 0.3, 0.0], dtype=F64)
+    torch.testing.assert_close(taken.final.suspended[0], hung, rtol=0, atol=1e-4)
 
 
 def test_segments_continue_its_motion():

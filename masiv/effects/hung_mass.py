@@ -6,7 +6,7 @@ import torch
 
 from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.effect import SuspendedMass, SuspendedMassEffect
-from masiv.effects.places import PLACE, as_guesses, face_centres, weights_around
+from masiv.effects.places import PLACE, as_guesses, face_centres, spacing_of, tied_weights
 from masiv.effects.search_hints import SearchHints
 
 SHORT, LONG = 0.5, 2.0
@@ -14,8 +14,11 @@ SHORT, LONG = 0.5, 2.0
 
 
 def _guesses(context: EffectContext) -> list[tuple[float, ...]]:
-    """From the centres of the body's faces, on a short and on a long thread."""
-    faces = face_centres(context.rest)
+    """From the centres of the body's faces, on a short and on a long thread. The matter of the outermost particles ends
+    half a spacing further out."""
+    outermost = face_centres(context.rest)
+    outwards = torch.stack([side * axis for axis in torch.eye(3) for side in (-1, 1)]).to(outermost)
+    faces = outermost + 0.5 * spacing_of(context.rest) * outwards
     return [guess for size in (SHORT, LONG) for guess in as_guesses(faces, size * context.size)]
 
 
@@ -23,10 +26,11 @@ class HungMass(SuspendedMassEffect):
     r"""$M\,\dot u = M g - T n$, $f_p = w_p T n$ with $T \ge 0$ such that $|y - \sum_p w_p x_p| \le L$: a mass $M$ at
     $y$ hangs on a thread of length $L$, tied to the matter around a place of the body at frame 0.
 
-    The weights are those of ``PointMass``. The thread does not stretch, has no weight and can go slack, so the mass
-    loads the body by its weight and takes part in its motion along the thread only; across it, it swings as a pendulum
-    with the period $2 \pi \sqrt{L / |g|}$. At frame 0 it hangs straight down and moves with that matter. It meets
-    neither the body nor the ground. A rollout with it has no gradient. Looked for in clamped bodies, on request.
+    The weights are those of ``PointMass``, corrected so that their mean is the place at a face, too. The thread does
+    not stretch, has no weight and can go slack, so the mass loads the body by its weight and takes part in its motion
+    along the thread only; across it, it swings as a pendulum with the period $2 \pi \sqrt{L / |g|}$. At frame 0 it
+    hangs straight down and moves with that matter. It meets neither the body nor the ground. A rollout with it has no
+    gradient. Looked for in clamped bodies, on request.
     """
 
     name = "hung_mass"
@@ -39,5 +43,5 @@ class HungMass(SuspendedMassEffect):
     hints = SearchHints(guesses=_guesses, needs_clamp=True, inside=True, on_request=True)
 
     def suspended_mass(self, theta: torch.Tensor, context: EffectContext) -> SuspendedMass:
-        weights = weights_around(context.rest, theta[1:4], context.size / 8)
+        weights = tied_weights(context.rest, theta[1:4], context.size / 8)
         return SuspendedMass(float(theta[0]), float(theta[4]), weights)

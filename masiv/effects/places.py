@@ -42,6 +42,29 @@ def weights_around(points: torch.Tensor, place: torch.Tensor, radius: float) -> 
     return weights()
 
 
+def tied_weights(points: torch.Tensor, place: torch.Tensor, radius: float) -> torch.Tensor:
+    r"""Weights (N,), of either sign, with sum 1 and mean ``place``, also at a face: ``weights_around`` times
+    $1 + (x_p - m) \cdot A^{-1} (c - m)$, with its mean m and covariance A.
+
+    A force that is shared out by them has the moment of one at ``place``, and their mean motion is that of ``place``
+    if the body deforms uniformly there (moving least squares, Lancaster & Salkauskas 1981). points (N, 3) [m]; place c
+    (3,) [m]; radius [m].
+    """
+    points, place = points.double(), place.double()
+    weights = weights_around(points, place, radius)
+    mean = (weights[:, None] * points).sum(0)
+    off = points - mean
+    covariance = (weights[:, None, None] * off[:, :, None] * off[:, None, :]).sum(0)
+    flat = 1e-9 * radius**2 * torch.eye(3, dtype=points.dtype)  # all points in a plane
+    return weights * (1 + off @ torch.linalg.solve(covariance + flat, place - mean))
+
+
+def spacing_of(points: torch.Tensor) -> float:
+    """Distance [m] from a point of (N, 3) to the nearest other one, median."""
+    points = points.double()
+    return float(torch.cdist(points, points).fill_diagonal_(torch.inf).min(1).values.median())
+
+
 def face_centres(points: torch.Tensor) -> torch.Tensor:
     """Means (6, 3) of the outermost points of (N, 3) at either end of each axis."""
     low, high = points.min(0).values, points.max(0).values

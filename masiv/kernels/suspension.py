@@ -53,7 +53,7 @@ class SuspensionKernels:
         self.place[s], self.velocity[s] = place, u - taken * along
         impulse = (load * taken) * along
         for p in range(count):
-            if self.weights[p] > 0.0:
+            if self.weights[p] != 0.0:
                 self.mpm.velocity[s, p] += (self.weights[p] / self.mpm.particle_mass[p]) * impulse
 
     @ti.kernel
