@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from masiv.effects.context import EffectParameter
 
@@ -61,8 +63,8 @@ def tied_weights(points: torch.Tensor, place: torch.Tensor, radius: float) -> to
 
 def spacing_of(points: torch.Tensor) -> float:
     """Distance [m] from a point of (N, 3) to the nearest other one, median."""
-    points = points.double()
-    return float(torch.cdist(points, points).fill_diagonal_(torch.inf).min(1).values.median())
+    known = points.double().numpy()
+    return float(np.median(cKDTree(known).query(known, k=2)[0][:, 1]))
 
 
 def face_centres(points: torch.Tensor) -> torch.Tensor:
