@@ -11,7 +11,7 @@ from typing import Any
 
 from masiv.files import require_file, write_bytes
 
-FORMAT = 1
+FORMAT = 2
 """Of the states: it changes when a stage keeps other things."""
 
 
@@ -66,10 +66,16 @@ class Checkpoint:
         write_bytes(self.path, data.getvalue())
         self._last = time.monotonic()
 
+    def part(self, name: str) -> Checkpoint:
+        """The checkpoint of a part that runs beside the stage, in a file of its own; ``clear`` removes it, too."""
+        return Checkpoint(self.path and self.path.with_stem(f"{self.path.stem}-{name}"), self.every_s)
+
     def clear(self) -> None:
         """Remove the state, after the stage is done."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
+            for part in self.path.parent.glob(f"{self.path.stem}-*{self.path.suffix}"):
+                part.unlink()
 
 
 class NestedCheckpoint(Checkpoint):

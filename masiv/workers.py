@@ -143,6 +143,11 @@ class Workers:
         return lambda: self._result(future)
 
     @property
+    def on_this_machine(self) -> bool:
+        """Whether tasks run where this process does, and see its files."""
+        return self._dask is None
+
+    @property
     def _here(self) -> bool:
         """Whether tasks run in this process."""
         return self.processes == 1 and self._dask is None

@@ -34,3 +34,16 @@ def test_without_a_path_nothing_is_kept():
     part.maybe_save(lambda: {"step": 1})
     part.save({"step": 2})
     assert part.load() is None
+
+
+def test_parts_that_run_beside_each_other_have_states_of_their_own_until_the_stage_is_done(tmp_path):
+    stage = Checkpoint(tmp_path / "stage.pt")
+    other = Checkpoint(tmp_path / "stage_two.pt")
+    for checkpoint, value in ((stage, 1), (stage.part("start-2"), 2), (other, 3)):
+        checkpoint.save({"value": value})
+    assert [c.load() for c in (stage, stage.part("start-2"), other)] == [{"value": v} for v in (1, 2, 3)]
+    stage.clear()
+    assert stage.load() is None
+    assert stage.part("start-2").load() is None
+    assert other.load() == {"value": 3}
+    assert Checkpoint(None).part("start-2").path is None

@@ -6,7 +6,7 @@ import torch
 from cube import scene, settings
 from small import SMALL
 
-from masiv.identification.losses.geometry import chamfer_error, surface_points, trajectory_error
+from masiv.identification.losses.geometry import chamfer_error, surface_points, trajectory_errors
 from masiv.identification.stage import identify
 
 
@@ -19,7 +19,7 @@ def test_a_chamfer_distance_does_not_see_which_particle_is_which():
     points = lattice()
     mixed = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))]
     assert float(chamfer_error(mixed[None], points[None])) < 1e-5
-    assert float(trajectory_error(mixed[None], points[None])) > 1
+    assert float(trajectory_errors(mixed[None], points[None])) > 1
 
 
 def test_chamfer_of_a_small_shift_is_the_shift_and_pulls_back():

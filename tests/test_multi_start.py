@@ -11,9 +11,11 @@ from masiv.identification.neural import multi_start
 from masiv.identification.neural.starting_law import StartingLaw
 from masiv.identification.neural.training import TrainingResult
 from masiv.identification.recording import FitRecording
+from masiv.materials.load import load_law
 from masiv.materials.neural import NeuralLaw
 from masiv.models.filmed_body import FilmedBody
 from masiv.models.initial_state import InitialState
+from masiv.pretraining.pretrain import pretrained_path
 from masiv.progress import silent
 
 
@@ -78,3 +80,39 @@ def test_fits_are_compared_after_the_surface_finetune(seen, monkeypatch):
 def test_if_every_fit_diverges_the_stage_says_so(seen, monkeypatch):
     with pytest.raises(MasivError, match="keeps diverging"):
         fit(seen, monkeypatch, {"maxwell_fluid": 0.1, "plasticine": 0.12}, {"maxwell_fluid": None, "plasticine": None})
+
+
+def test_the_second_of_two_fits_goes_on_where_it_was_killed(seen, tmp_path):
+    class Stop(Exception):
+        pass
+
+    config = settings(iterations=4)
+    problem = FilmedBody(scene(), seen[0], SMALL, samples=config.samples_per_frame)
+    recordings = [
+        FitRecording(Objective(problem, config), InitialState.of_world(problem.axes, [0.0] * 3, [0.0] * 3), 3)
+    ]
+    starts = [
+        StartingLaw(name, "sticky", load_law(pretrained_path(name)), 0.1).state() for name in ("jelly", "plasticine")
+    ]
+
+    def fitted(name, progress):
+        checkpoint = Checkpoint(tmp_path / f"{name}.pt", every_s=0)
+        if checkpoint.load() is None:
+            checkpoint.save({"starts": starts})
+        result = multi_start.fit_neural_law(recordings, lambda: pytest.fail("no search"), 0, checkpoint, progress)
+        checkpoint.clear()
+        return result
+
+    def stops(stage, done, *_):
+        if (stage, done) == ("identify: fit, second start", 2):
+            raise Stop
+
+    whole, steps = fitted("whole", silent), []
+    with pytest.raises(Stop):
+        fitted("killed", stops)
+    resumed = fitted("killed", lambda stage, done, *_: steps.append((stage, done)))
+    assert [done for stage, done in steps if stage == "identify: fit, second start"] == [2, 3, 4]
+    assert resumed.report == whole.report
+    assert resumed.trajectory_error == whole.trajectory_error
+    assert resumed.history == whole.history
+    assert not list(tmp_path.glob("*.pt"))

@@ -59,7 +59,7 @@ def test_a_law_of_two_recordings_explains_both(seen, dropped):
     assert end.trajectory_error < 0.4 * start.trajectory_error
     with torch.no_grad():
         errors = [
-            float(r.objective.trajectory_error(r.objective.problem.run(end.law, state, "sticky", r.frames)))
+            float(r.objective.trajectory_errors(r.objective.whole_rollout(end.law, state, "sticky")).mean())
             for r, state in zip(both, end.initial_states, strict=True)
         ]
     assert max(errors) < 0.01
@@ -75,7 +75,7 @@ def test_each_recording_has_the_same_weight(seen, dropped, monkeypatch):
     of_law = len(list(stiffer(1.0).parameters()))
     with monkeypatch.context() as patched:
         patched.setattr(
-            TrainingState, "step", lambda self: gradients.append([p.grad.clone() for p in self._parameters[:of_law]])
+            TrainingState, "step", lambda self, _: gradients.append([p.grad.clone() for p in self._parameters[:of_law]])
         )
         one = recordings_of(seen, dropped, settings(iterations=1))[:1]
         fitted(one)

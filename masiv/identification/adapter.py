@@ -6,7 +6,7 @@ from typing import Any
 
 from masiv.checkpoint import Checkpoint, NestedCheckpoint
 from masiv.identification.classical.fit import FamilyFit
-from masiv.identification.neural.training import train
+from masiv.identification.neural.training import train, whole_trajectory_error
 from masiv.identification.recording import FitRecording
 from masiv.identification.result import IdentificationResult
 from masiv.materials.adapter import AdapterLaw
@@ -35,6 +35,7 @@ def fit_adapter(
     nested = NestedCheckpoint(checkpoint, checkpoint.load() or {})
     trained = train([start], law, base.contact, seed=seed, checkpoint=nested, progress=progress)
     report = {**report, "classical_error_mm": 1e3 * base.error_m}
+    error = whole_trajectory_error([start], trained, base.contact)
     return IdentificationResult(
-        trained.law, trained.initial_states[0], base.contact, trained.trajectory_error, report, trained.history_rows()
+        trained.law, trained.initial_states[0], base.contact, error, report, trained.history_rows()
     )

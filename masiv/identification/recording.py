@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from masiv.continuum.trajectory import Trajectory
 from masiv.identification.config import IdentifyConfig
@@ -22,10 +23,13 @@ class FitRecording:
     initial_state: InitialState
     first_frames: int
 
-    @property
+    @cached_property
     def frames(self) -> int:
-        """Frames of the recording after frame 0."""
-        return self.objective.problem.frames
+        """Frames after frame 0 that the fit simulates: until the observed body is at rest.
+
+        Frames at rest show one shape again and again, and the gradient through them is long.
+        """
+        return self.objective.problem.moving_frames
 
 
 def prepare_recording(

@@ -41,7 +41,7 @@ def image_losses(objective: Objective, fits: Sequence[FamilyFit]) -> dict[str, f
 
     def loss(fit: FamilyFit) -> float:
         try:
-            errors = finetune.rollout_image_errors(fit.law, fit.initial_state, fit.contact)
+            errors = finetune.whole_image_errors(finetune.whole_rollout(fit.law, fit.initial_state, fit.contact))
             return float(finetune.image_loss(errors).mean())
         except NonFiniteError:
             return math.inf

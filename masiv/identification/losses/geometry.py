@@ -22,9 +22,9 @@ SURFACE_OFFSET = 0.25
 distance."""
 
 
-def trajectory_error(positions: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
-    """Mean distance () [m] of particles (K, N, 3) [m] to their own targets (K, N, 3) [m], over K instants."""
-    return (positions - targets).norm(dim=2).mean()
+def trajectory_errors(positions: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+    """Mean distances (K,) [m] of particles (K, N, 3) [m] to their own targets (K, N, 3) [m] at each of K instants."""
+    return (positions - targets).norm(dim=2).mean(dim=1)
 
 
 def mean_distance(residual: np.ndarray) -> float:

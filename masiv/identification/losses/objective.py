@@ -13,7 +13,7 @@ import torch
 
 from masiv.continuum.trajectory import Trajectory
 from masiv.identification.config import IdentifyConfig
-from masiv.identification.losses.geometry import chamfer_error, surface_points, trajectory_error
+from masiv.identification.losses.geometry import chamfer_error, surface_points, trajectory_errors
 from masiv.identification.losses.images import ImageTerms, pictures_of_each_frame
 from masiv.materials.law import Law
 from masiv.models.filmed_body import FilmedBody
@@ -74,14 +74,14 @@ class Objective:
         """Whether surfaces and pictures are fitted after the paths."""
         return self.config.surface_finetune and self.config.geometry_loss == "trajectory" and self.compares_images
 
-    def trajectory_error(self, positions: torch.Tensor) -> torch.Tensor:
-        """Mean distance () [m] of ``positions`` (K, N, 3) [m, simulation frame] to the observed trajectories."""
-        return trajectory_error(positions, self.problem.targets[: len(positions)])
+    def trajectory_errors(self, positions: torch.Tensor) -> torch.Tensor:
+        """Mean distances (K,) [m] of ``positions`` (K, N, 3) [m, simulation frame] to the observed trajectories."""
+        return trajectory_errors(positions, self.problem.targets[: len(positions)])
 
     def geometry_error(self, positions: torch.Tensor) -> torch.Tensor:
         """The geometry loss () [m] of ``config.geometry_loss``; 0 if that is none. ``positions`` as above."""
         if self.config.geometry_loss == "trajectory":
-            return self.trajectory_error(positions)
+            return self.trajectory_errors(positions).mean()
         if self.config.geometry_loss == "none":
             return torch.zeros(())
         samples, targets = self.problem.samples, self.problem.targets[: len(positions)]
@@ -114,15 +114,17 @@ class Objective:
         return float(value)
 
     @torch.no_grad()
-    def rollout_image_errors(
-        self, law: Law, initial_state: InitialState, contact: str
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Errors of silhouettes (T,) and colors (T,) of a rollout, means of ``VIEWS_COMPARED`` pictures of each frame.
+    def whole_rollout(self, law: Law, initial_state: InitialState, contact: str) -> torch.Tensor:
+        """Positions (K, N, 3) [m, simulation frame] over all frames, those at rest included. Raises NonFiniteError."""
+        return self.problem.run(law, initial_state, contact, self.problem.frames)
 
-        Raises NonFiniteError if the rollout diverges.
+    @torch.no_grad()
+    def whole_image_errors(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Errors of silhouettes (T,) and colors (T,) of a ``whole_rollout``.
+
+        They are means of ``VIEWS_COMPARED`` pictures of each frame.
         """
         problem = self.problem
-        positions = problem.run(law, initial_state, contact, problem.frames)
         pictures = pictures_of_each_frame(problem.scene.views, problem.frames, VIEWS_COMPARED)
         silhouettes, colors = self.images.errors_by_picture(positions, pictures)
         return silhouettes.reshape(problem.frames, -1).mean(1), colors.reshape(problem.frames, -1).mean(1)

@@ -10,7 +10,7 @@ from masiv.checkpoint import Checkpoint, NestedCheckpoint
 from masiv.identification.losses.objective import Objective
 from masiv.identification.neural.starting_law import StartingLaw, choose_starting_laws, rank_starting_laws
 from masiv.identification.neural.surface_finetune import finetune_surfaces
-from masiv.identification.neural.training import TrainingResult, train
+from masiv.identification.neural.training import TrainingResult, train, whole_trajectory_error
 from masiv.identification.recording import FitRecording
 from masiv.identification.result import IdentificationResult
 from masiv.materials.neural import NeuralLaw
@@ -42,7 +42,8 @@ def fit_neural_law(
     """The neural law that explains all ``recordings`` best, and the initial state of the first.
 
     coarse: makes the objective of the first recording with few particles, for the choice of starting laws.
-    Raises MasivError if every fit diverges.
+    The error of the result is over all frames of the recordings, those at rest included. Raises MasivError if every fit
+    diverges.
     """
     config = recordings[0].objective.config
     saved = checkpoint.load() or {}
@@ -69,8 +70,9 @@ def fit_neural_law(
     }  # fmt: skip
     trained, contact = best.trained, best.start.contact
     return IdentificationResult(
-        trained.law, trained.initial_states[0], contact, trained.trajectory_error, report, trained.history_rows()
-    )
+        trained.law, trained.initial_states[0], contact, whole_trajectory_error(recordings, trained, contact), report,
+        trained.history_rows(),
+    )  # fmt: skip
 
 
 def _starts_to_fit(starts: Sequence[StartingLaw]) -> list[StartingLaw]:
@@ -86,14 +88,19 @@ def _fit_in_parallel(
     progress: Progress,
     workers: Workers,
 ) -> list[dict[str, Any] | TaskError]:
-    """The state of the fit from each of ``starts``: the first in this process, with the checkpoint; the others in
-    ``workers``."""
+    """The state of the fit from each of ``starts``: the first in this process, the others in ``workers``.
+
+    Each has a checkpoint of its own; another machine has none.
+    """
 
     def second_progress(stage: str, done: int, total: int, note: str = "") -> None:
         progress(f"{stage}, second start", done, total, note)
 
     progress_of_others = silent if workers.processes > 1 else second_progress
-    others = [workers.submit(_fit_without_checkpoint, (recordings, s, seed, progress_of_others)) for s in starts[1:]]
+    others = []
+    for k, start in enumerate(starts[1:], 2):
+        part = checkpoint.part(f"start-{k}") if workers.on_this_machine else Checkpoint(None)
+        others.append(workers.submit(_fit_from_start, (recordings, start, seed, part, progress_of_others)))
     first = run_task(_fit_from_start, (recordings, starts[0], seed, checkpoint, progress))
     return [first, *(result() for result in others)]
 
@@ -126,13 +133,6 @@ def _fit_from_start(
             recordings, trained, start.contact, start.law, seed=seed, checkpoint=nested, progress=progress
         )
     return {"trained": trained.state(), "loss": loss, "report": report}
-
-
-def _fit_without_checkpoint(
-    recordings: Sequence[FitRecording], start: StartingLaw, seed: int, progress: Progress
-) -> dict[str, Any]:
-    """``_fit_from_start`` as a task of another process."""
-    return _fit_from_start(recordings, start, seed, Checkpoint(None), progress)
 
 
 def _fit_from_state(start: StartingLaw, state: dict[str, Any]) -> _FitFromStart:

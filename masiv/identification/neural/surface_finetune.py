@@ -7,12 +7,14 @@ drift.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 
 import torch
 
 from masiv.checkpoint import Checkpoint
+from masiv.errors import NonFiniteError
 from masiv.identification.losses.objective import Objective
 from masiv.identification.neural.training import TrainingResult, train
 from masiv.identification.recording import FitRecording
@@ -32,8 +34,9 @@ def finetune_surfaces(
 ) -> tuple[TrainingResult, float, dict[str, float]]:
     """Continue from ``trained``, a neural law, with half as many iterations on surfaces and pictures.
 
-    Returns the new result if its image loss is clearly lower (``is_clearly_lower``), else ``trained``; its image loss;
-    and the image errors of both.
+    Returns the new result if its image loss over all frames is clearly lower (``is_clearly_lower``), else ``trained``;
+    its image loss; and the image errors of both, those of a result that diverges left out. Raises NonFiniteError if
+    ``trained`` diverges after the frames of its fit.
     """
     path_iterations = recordings[0].objective.config.iterations
     objectives = [r.objective.with_surface_loss(path_iterations // 2) for r in recordings]
@@ -46,16 +49,15 @@ def finetune_surfaces(
         label="identify: fit surfaces",
     )  # fmt: skip
     finetuned.history = [*trained.history, *((i + path_iterations, *row) for i, *row in finetuned.history)]
-    errors = {
-        name: _image_errors(objectives, result, contact)
-        for name, result in (("paths", trained), ("surfaces", finetuned))
-    }
+    errors = {"paths": _image_errors(objectives, trained, contact)}
+    with contextlib.suppress(NonFiniteError):
+        errors["surfaces"] = _image_errors(objectives, finetuned, contact)
     report = {f"silhouette_error_of_{name}": float(silhouette.mean()) for name, (silhouette, _) in errors.items()}
     if objectives[0].images.colors is not None:
         report |= {f"color_error_of_{name}": float(color.mean()) for name, (_, color) in errors.items()}
-    before, after = (objectives[0].image_loss(e) for e in errors.values())
-    if is_clearly_lower(after, before):
-        return finetuned, float(after.mean()), report
+    before, *after = (objectives[0].image_loss(e) for e in errors.values())
+    if after and is_clearly_lower(after[0], before):
+        return finetuned, float(after[0].mean()), report
     return trained, float(before.mean()), report
 
 
@@ -76,7 +78,7 @@ def _image_errors(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Errors (T,) of silhouettes and of colors, of the frames of all recordings."""
     errors = [
-        objective.rollout_image_errors(trained.law, state, contact)
+        objective.whole_image_errors(objective.whole_rollout(trained.law, state, contact))
         for objective, state in zip(objectives, trained.initial_states, strict=True)
     ]
     silhouettes, colors = zip(*errors, strict=True)

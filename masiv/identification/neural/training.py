@@ -24,27 +24,33 @@ from masiv.identification.neural.training_state import TrainingState
 from masiv.identification.recording import FitRecording
 from masiv.materials.adapter import AdapterLaw
 from masiv.materials.neural import NeuralLaw
+from masiv.models.filmed_body import REST_CELLS
 from masiv.models.initial_state import InitialState
 from masiv.progress import Progress
 
 
 @dataclass(frozen=True)
 class _RolloutErrors:
-    """Mean distance to the trajectories [m], silhouette error (), and the objective if the rollout was over all
-    frames."""
+    """Mean distances (K,) to the trajectories [m] at each instant, silhouette error (), and the objective if the
+    rollout was over all frames of the fit."""
 
     frames: int
-    trajectory: float
+    by_instant: torch.Tensor
     silhouette: float
     objective: float | None
+
+    @property
+    def trajectory(self) -> float:
+        """Mean distance to the trajectories [m]."""
+        return float(self.by_instant.mean())
 
 
 @dataclass
 class TrainingResult:
     """The best parameters so far.
 
-    initial_states: one of each recording. trajectory_error: mean distance to the trajectories [m] over all frames;
-    objective: mean over the recordings. history: (iteration, frames, trajectory error [m], silhouette error).
+    initial_states: one of each recording. trajectory_error: mean distance to the trajectories [m] over the frames of
+    the fit; objective: mean over the recordings. history: (iteration, frames, trajectory error [m], silhouette error).
     """
 
     law: NeuralLaw | AdapterLaw
@@ -59,7 +65,8 @@ class TrainingResult:
         law: NeuralLaw | AdapterLaw,
         initial_states: Sequence[InitialState],
     ) -> None:
-        """Take ``law`` and ``initial_states`` if all ``rollouts`` are over all frames and their objective is less."""
+        """Take ``law`` and ``initial_states`` if all ``rollouts`` are over all frames of the fit and their objective is
+        less."""
         objectives = [r.objective for r in rollouts if r.objective is not None]
         if len(objectives) == len(rollouts) and mean(objectives) < self.objective:
             self.objective, self.trajectory_error = mean(objectives), mean(r.trajectory for r in rollouts)
@@ -112,10 +119,11 @@ def train(
 ) -> TrainingResult:
     """Minimise the mean objective over ``recordings`` of one body with Adam, from ``law``, which is not changed.
 
-    The horizon grows from the first frames of each recording to all frames over the first half of the iterations. If a
-    rollout diverges, the last step is undone, the step sizes are halved and the horizon ends a frame earlier; both
-    recover with successful steps. Returns the parameters with the least objective over all frames. prior: the law to
-    which a neural law is drawn; ``law`` if None. Raises MasivError if rollouts keep diverging.
+    The horizon grows from the first frames of each recording to its last (``FitRecording.frames``) over the first half
+    of the iterations. If a rollout diverges, the last step is undone, the step sizes are halved and the horizon ends a
+    frame earlier; both recover with successful steps. A step after which the distance to the trajectories is
+    ``WORSE`` times as large is halved. Returns the parameters with the least objective over all these frames. prior:
+    the law to which a neural law is drawn; ``law`` if None. Raises MasivError if rollouts keep diverging.
     """
     config = recordings[0].objective.config
     drawn_to, law = prior or law, copy.deepcopy(law)
@@ -123,6 +131,7 @@ def train(
         InitialState(*(t.detach().clone().requires_grad_() for t in r.initial_state.tensors())) for r in recordings
     ]
     training = TrainingState(law, initial_states, config, max(r.frames for r in recordings))
+    resolution = REST_CELLS * mean(r.objective.problem.spacing for r in recordings)
     best = TrainingResult(copy.deepcopy(law), _copied(initial_states))
     first = _restored(checkpoint, training, best)
     for i in range(first, config.iterations):
@@ -135,7 +144,7 @@ def train(
                 frames = min(training.horizon, _scheduled_horizon(i, config.iterations, recording))
                 rollouts.append(
                     _backpropagate(
-                        recording.objective, law, initial_state, contact, frames,
+                        recording, law, initial_state, contact, frames,
                         prior_loss=_prior_loss(law, drawn_to, config.prior_weight),
                         weight=1 / len(recordings), seed=(seed, i, k),
                     )
@@ -149,7 +158,11 @@ def train(
             continue
         frames, error = max(r.frames for r in rollouts), mean(r.trajectory for r in rollouts)
         best.history.append((i, frames, error, mean(r.silhouette for r in rollouts)))
-        training.step()
+        errors = [r.by_instant for r in rollouts]
+        if training.is_worse(errors, resolution):
+            training.halve_step()
+        else:
+            training.step(errors)
         progress(label, i + 1, config.iterations, f"{1e3 * error:.1f} mm over {frames} frames")
     if math.isinf(best.objective):  # no iteration reached the last frame
         training.undo()
@@ -159,7 +172,7 @@ def train(
 
 
 def _backpropagate(
-    objective: Objective,
+    recording: FitRecording,
     law: NeuralLaw | AdapterLaw,
     initial_state: InitialState,
     contact: str,
@@ -173,18 +186,19 @@ def _backpropagate(
 
     Raises NonFiniteError.
     """
-    problem = objective.problem
-    positions = problem.run(law, initial_state, contact, frames)
-    trajectory_error = objective.trajectory_error(positions)
+    objective = recording.objective
+    positions = objective.problem.run(law, initial_state, contact, frames)
+    by_instant = objective.trajectory_errors(positions)
+    trajectory_error = by_instant.mean()
     image_errors = _sampled_image_errors(objective, positions, frames, seed)
     on_paths = objective.config.geometry_loss == "trajectory"
     geometry_error = trajectory_error if on_paths else objective.geometry_error(positions)
     loss = objective.loss(geometry_error, image_errors) + prior_loss
     errors = _RolloutErrors(
         frames,
-        float(trajectory_error.detach()),
+        by_instant.detach(),
         float(image_errors[0].detach()),
-        objective.evaluate(positions) if frames == problem.frames else None,
+        objective.evaluate(positions) if frames == recording.frames else None,
     )
     (weight * loss).backward()
     return errors
@@ -194,10 +208,23 @@ def _backpropagate(
 def _whole_rollout(
     recording: FitRecording, initial_state: InitialState, law: NeuralLaw | AdapterLaw, contact: str
 ) -> _RolloutErrors:
-    """The errors of a rollout over all frames."""
+    """The errors of a rollout over all frames of the fit."""
     objective, frames = recording.objective, recording.frames
     positions = objective.problem.run(law, initial_state, contact, frames)
-    return _RolloutErrors(frames, float(objective.trajectory_error(positions)), 0.0, objective.evaluate(positions))
+    return _RolloutErrors(frames, objective.trajectory_errors(positions), 0.0, objective.evaluate(positions))
+
+
+def whole_trajectory_error(recordings: Sequence[FitRecording], trained: TrainingResult, contact: str) -> float:
+    """Mean distance to the trajectories [m] over all frames of ``recordings``, those at rest included.
+
+    Raises NonFiniteError if a rollout diverges after the frames of the fit.
+    """
+    if all(r.frames == r.objective.problem.frames for r in recordings):
+        return trained.trajectory_error
+    return mean(
+        float(r.objective.trajectory_errors(r.objective.whole_rollout(trained.law, state, contact)).mean())
+        for r, state in zip(recordings, trained.initial_states, strict=True)
+    )
 
 
 def _prior_loss(law: NeuralLaw | AdapterLaw, prior: NeuralLaw | AdapterLaw, weight: float) -> torch.Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -15,7 +16,10 @@ from masiv.materials.neural import NeuralLaw
 from masiv.models.initial_state import InitialState
 
 MAX_FAILURES = 8
-"""Diverged rollouts in a row after which the training stops."""
+"""Diverged rollouts in a row after which the training stops, or halvings of one step after which it is accepted."""
+WORSE = 2.0
+"""A step is halved if it makes the distance to the trajectories this many times as large. Chosen: such a step moves the
+body farther than it was off."""
 LR_RECOVERY = 1.4
 """Factor by which reduced step sizes grow with each successful step."""
 MAX_GRADIENT_NORM = 1.0
@@ -56,6 +60,7 @@ class TrainingState:
         self._ground_range = config.ground_range
         self._max_frames = self.horizon = max_frames
         self._lr_backoff, self._failures = 1.0, 0
+        self._errors: list[torch.Tensor] = []
         self.accept()
 
     def schedule(self, progress: float) -> None:
@@ -73,9 +78,22 @@ class TrainingState:
         """Remember the parameters: their rollouts have succeeded."""
         self._accepted = [p.detach().clone() for p in self._parameters]
 
-    def step(self) -> None:
-        """Accept the parameters, then step along the gradient."""
+    def is_worse(self, errors: Sequence[torch.Tensor], resolution: float) -> bool:
+        """Whether distances to the trajectories [m] are more than ``WORSE`` times those of the accepted parameters.
+
+        errors: of each recording (K,), means at its first K instants. Compared are the instants that both have.
+        resolution [m]: smaller distances count as this one.
+        """
+        if not self._errors or self._failures >= MAX_FAILURES:
+            return False
+        pairs = [(b[: len(a)], a[: len(b)]) for b, a in zip(self._errors, errors, strict=True)]
+        before, after = (fmean(float(e.mean()) for e in side) for side in zip(*pairs, strict=True))
+        return after > WORSE * max(before, resolution)
+
+    def step(self, errors: Sequence[torch.Tensor]) -> None:
+        """Accept the parameters, whose ``errors`` are as in ``is_worse``, then step along the gradient."""
         self.accept()
+        self._errors = list(errors)
         self._failures, self._lr_backoff = 0, min(1.0, LR_RECOVERY * self._lr_backoff)
         self.horizon = min(self._max_frames, self.horizon + 1)
         for group in self._optimizer.param_groups:
@@ -91,6 +109,16 @@ class TrainingState:
             for parameter, value in zip(self._parameters, self._accepted, strict=True):
                 parameter.copy_(value)
 
+    def halve_step(self) -> None:
+        """Go back half of the last step, and halve the step sizes to come.
+
+        Backtracking: Nocedal & Wright, Numerical Optimization, 2006, section 3.1.
+        """
+        self._failures, self._lr_backoff = self._failures + 1, self._lr_backoff / 2
+        with torch.no_grad():
+            for parameter, value in zip(self._parameters, self._accepted, strict=True):
+                parameter.lerp_(value, 0.5)
+
     def back_off(self, frames: int, diverged: NonFiniteError) -> None:
         """Undo the last step, after which a rollout of ``frames`` frames diverged; halve the step sizes and shorten the
         horizon. Raises MasivError after ``MAX_FAILURES`` in a row."""
@@ -105,6 +133,8 @@ class TrainingState:
             "lr_backoff": self._lr_backoff,
             "failures": self._failures,
             "horizon": self.horizon,
+            "errors": self._errors,
+            "accepted": self._accepted,
             "parameters": [p.detach() for p in self._parameters],
             "optimizer": self._optimizer.state_dict(),
         }
@@ -116,4 +146,4 @@ class TrainingState:
                 parameter.copy_(value)
         self._optimizer.load_state_dict(state["optimizer"])
         self._lr_backoff, self._failures, self.horizon = state["lr_backoff"], state["failures"], state["horizon"]
-        self.accept()
+        self._errors, self._accepted = state["errors"], state["accepted"]
