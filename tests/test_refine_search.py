@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,6 +39,18 @@ def test_nothing_is_missing_if_nothing_is(seed):
     result = refined(LinearModel({"velocity_z": 0.3}, seed=seed))
     assert (result.verdict, result.accepted, result.changes_twin) == ("nothing missing", (), False)
     assert result.reduced_chi(result.after) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("determined", "verdict"), [(True, "nothing missing"), (False, "cannot tell")])
+def test_a_probable_effect_that_would_not_have_been_seen_leaves_the_question_open(determined, verdict):
+    result = refined(LinearModel({"velocity_z": 0.3}))
+    sets = {frozenset[str](): 0.6, frozenset({"viscosity"}): 0.36}
+    (last,) = result.search.rounds[-1:]
+    last = replace(last, posterior=SimpleNamespace(credible_set=lambda: sets))
+    limits = [replace(x, determined=determined or x.effect != "viscosity") for x in result.search.limits]
+    assert "viscosity" in {x.effect for x in limits}
+    search = replace(result.search, rounds=(last,), limits=tuple(limits))
+    assert replace(result, search=search).verdict == verdict
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -67,13 +67,19 @@ def test_an_effect_that_was_added():
 
 def test_errors_of_another_model_are_named_as_such():
     """Without an added effect, refine's residual is that of its classical law, not of the twin."""
-    found = document(accepted=[], verdict="nothing missing", null_probability=0.8, after=document()["before"])
+    found = document(
+        accepted=[], verdict="nothing missing", null_probability=0.8, after=document()["before"], credible_set=[]
+    )
     _, acts, far, sure = answer_cards(twin(), None, [found], [Agreement(9.9, "mean distance from the true motion")])
     assert far.answer == "9.90 mm"
     assert "40.2 mm" in far.lines[1]
     assert "classical law that masiv refine fitted" in far.lines[1]
     assert acts.answer == "Nothing that this motion shows"
     assert sure.answer == "Nothing missing"
+    assert "Not excluded" not in " ".join(sure.lines)
+    found["credible_set"] = [{"effects": [], "probability": 0.8}, {"effects": ["viscosity"], "probability": 0.16}]
+    _, _, _, sure = answer_cards(twin(), None, [found], [])
+    assert "Not excluded: viscosity (16 %)." in sure.lines
     assert "→" not in " ".join([far.answer, *far.lines])
 
 

@@ -70,6 +70,7 @@ def text(document: Mapping[str, Any]) -> str:
             f"{shown['unknown_probability']:.2g}; a residual as large as that after has a probability of "
             f"{shown['predictive_p']['after']:.2g} if nothing is missing"
         )
+        lines += _credible_lines(shown["credible_set"])
         lines += [
             f"test, {name}: {x['rmse_mm']:.1f} mm, expected {x['expected_rmse_mm']:.1f} mm, log density "
             f"{x['log_density']:.1f}"
@@ -105,6 +106,12 @@ def _force_lines(force: Mapping[str, Any]) -> list[str]:
 def _refit_line(row: Mapping[str, Any]) -> str:
     errors = f"{row['fit_rmse_mm']:.1f} mm{_validation(row['validation_rmse_mm'])}"
     return f"  refit {row['effect']} ({row['law']}): {errors}: {outcome(row)}"
+
+
+def _credible_lines(sets: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What may act, where that is more than one answer."""
+    told = [f"{' and '.join(s['effects']) or 'no effect'} {s['probability']:.2g}" for s in sets]
+    return [f"95 % credible set of the first round: {', '.join(told)}"] if len(told) > 1 else []
 
 
 def _limit_lines(limits: Sequence[Mapping[str, Any]]) -> list[str]:

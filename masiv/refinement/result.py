@@ -103,17 +103,25 @@ class RefineResult:
     def verdict(self) -> str:
         """ "unexplained residual" if so large a residual is improbable with nothing missing, whether an effect was
         added or not; else "effect added"; "nothing missing" if no effect and nothing unknown is more probable than not,
-        and most effects would have been seen; else "cannot tell"; "ranked only" if none was fitted."""
+        and most effects and all of the credible set would have been seen; else "cannot tell"; "ranked only" if none was
+        fitted."""
         if self.ranked_only:
             return RANKED
         if self.predictive_p["after"] < self.config.min_predictive_p:
             return UNEXPLAINED
         if self.accepted:
             return ADDED
-        visible = sum(limit.determined for limit in self.search.limits)
-        seen = 2 * visible >= len(self.search.limits)
+        limits = self.search.limits
+        unseen = {limit.effect for limit in limits if not limit.determined}
+        seen = 2 * len(unseen) <= len(limits) and not unseen & self._plausible
         nothing = self.search.null_probability > 0.5 and self.search.unknown_probability < 0.5
         return NOTHING if seen and nothing else CANNOT_TELL
+
+    @property
+    def _plausible(self) -> frozenset[str]:
+        """Terms in the credible set of the last round."""
+        posterior = self.search.rounds[-1].posterior if self.search.rounds else None
+        return frozenset().union(*(posterior.credible_set() if posterior else ()))
 
     @property
     def predictive_p(self) -> Mapping[str, float]:

@@ -200,16 +200,24 @@ def _how_sure(twin: Twin, material: Mapping[str, Any] | None, refined: Sequence[
     return Card(question, answer, lines, open=doubtful)
 
 
+def _together(effects: Sequence[str]) -> str:
+    return " and ".join(words(name.partition("@")[0]) for name in effects) or "no effect"
+
+
 def _probabilities(document: Mapping[str, Any]) -> list[str]:
     lines = []
     first = next(iter(document["credible_set"]), None)
     if document["accepted"]:
         lines.append(f"Probability of the model without any effect: {percent(document['null_probability'])}.")
         if first is not None:
-            named = " and ".join(words(name.partition("@")[0]) for name in first["effects"]) or "no effect"
-            lines.append(f"Most probable in the first round: {named}, {percent(first['probability'])}.")
+            lines.append(
+                f"Most probable in the first round: {_together(first['effects'])}, {percent(first['probability'])}."
+            )
     else:
         lines.append(f"Probability that no effect of the library acts: {percent(document['null_probability'])}.")
+        may_act = [s for s in document["credible_set"] if s["effects"]]
+        told = (f"{_together(s['effects'])} ({percent(s['probability'])})" for s in may_act)
+        lines += [f"Not excluded: {', '.join(told)}."] if may_act else []
     lines.append(f"Probability that something unknown acts: {percent(document['unknown_probability'])}.")
     chance = document["predictive_p"]["after"]
     more = "else " if document["accepted"] else ""
