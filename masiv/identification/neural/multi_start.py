@@ -102,6 +102,8 @@ def _fit_in_parallel(
         part = checkpoint.part(f"start-{k}") if workers.on_this_machine else Checkpoint(None)
         others.append(workers.submit(_fit_from_start, (recordings, start, seed, part, progress_of_others)))
     first = run_task(_fit_from_start, (recordings, starts[0], seed, checkpoint, progress))
+    if others and progress_of_others is silent:
+        progress("identify: fit, second start", 0, 1, "goes on in another process")
     return [first, *(result() for result in others)]
 
 
