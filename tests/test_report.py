@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -17,7 +19,7 @@ from masiv.report.page import Page, number
 from masiv.report.plotly_script import packed_script
 from masiv.report.time_charts import convergence, over_time
 from masiv.scene.camera import Camera
-from masiv.scene.scene import Ground
+from masiv.scene.scene import Frame, Ground, Scene
 from masiv.splat.gaussians import Gaussians
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -134,6 +136,43 @@ def test_video_and_picture_are_written_whole(tmp_path):
     shown = np.stack([np.frombuffer(data, np.uint8).reshape(34, 48, 3) for data in reader])
     np.testing.assert_allclose(shown.mean(axis=(1, 2, 3)), [0, 40, 80, 120], atol=4)
     assert sorted(p.name for p in tmp_path.rglob("*.*")) == ["p.png", "v.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "count", "kept"),
+    [
+        (range(5), 5, [0, 1, 2, 3, 4]),
+        (range(5), 9, [0, 1, 2, 3, 4]),
+        (range(10, 21), 3, [10, 15, 20]),
+        (range(120), 2, [0, 119]),
+        (range(120), 0, [0]),
+        ((), 4, []),
+    ],
+)
+def test_measured_frames_are_spread_from_the_first_to_the_last(frames, count, kept):
+    assert measure.evenly_spread(frames, count) == kept
+
+
+def test_of_a_large_recording_as_many_pictures_are_measured_as_a_mean_needs(taichi, monkeypatch):
+    monkeypatch.setattr(measure, "MAX_PICTURES", 6)
+    loaded = []
+
+    def load(view, frame):
+        loaded.append((view, frame))
+        return Frame(np.zeros((48, 64, 3), np.uint8), np.ones((48, 64)), np.ones((48, 64), bool))
+
+    cameras = (camera(), camera())
+    scene = Scene(
+        path=Path("drawn"), layout="none", fps=10.0, frame_count=9, cameras=cameras, gravity=np.zeros(3),
+        up=np.array([0.0, 1.0, 0.0]), ground=None, density=1.0, load=load, mask_source="none",
+    )  # fmt: skip
+    points = cloud()
+    drawn = Gaussians(points.means.float(), points.scales.float(), points.opacities, points.colours)
+    numbers = measure.picture_numbers(scene, lambda _: drawn, [0, 1], list(range(9)))
+    assert numbers is not None
+    assert numbers["frames"] == [0, 4, 8]
+    assert len(numbers["psnr_box_db_by_frame"]) == 3
+    assert sorted(set(loaded)) == [(v, f) for v in (0, 1) for f in (0, 4, 8)]
 
 
 def test_truth_and_motion_numbers(tmp_path):

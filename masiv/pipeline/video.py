@@ -150,7 +150,9 @@ class VideoRun(Run):
         with stages.material_description(folder, self.config, twin):
             rollout = simulate(twin, frames=scene.frame_count, fps=scene.fps, progress=progress)
             rollout.save(folder.rollout)
+            progress("measure pictures", 0, 1)
             numbers = run_numbers(folder, scene, dynamic, trajectory, rollout.positions)
+            progress("measure pictures", 1, 1)
         numbers |= material_numbers(folder)
         write_json(folder.metrics, numbers)
         progress("report", 0, 1)

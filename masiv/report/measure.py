@@ -22,6 +22,9 @@ MIN_TRUE_PARTICLES = 8
 _OTHER_SIZE = 5.0
 """Ratio of sizes from which on two bodies are not one: a reconstruction is within tens of per cent, and the next unit
 of length is a factor of ten away."""
+MAX_PICTURES = 400
+"""Pictures that a mean is of, at most. Of 400 independent ones it has a standard error of a twentieth of their scatter;
+large recordings have thousands, and a picture of two megapixels takes a second."""
 UNITS = {
     "psnr_db": "dB, whole picture, object on black",
     "psnr_box_db": "dB, box of the observed mask, object on black",
@@ -37,13 +40,22 @@ UNITS = {
 }
 
 
+def evenly_spread(values: Sequence[int], count: int) -> list[int]:
+    """``count`` of ``values``, at least one, with the first and the last; all if there are no more."""
+    if len(values) <= count:
+        return list(values)
+    return [values[k] for k in np.linspace(0, len(values) - 1, max(count, 1)).round().astype(int)]
+
+
 def picture_numbers(
     scene: Scene, gaussians_at: Callable[[int], Gaussians], views: Sequence[int], frames: Sequence[int]
 ) -> dict[str, Any] | None:
     """Mean PSNR, SSIM and mask IoU of drawn Gaussians against the observed object, or None without view or frame.
 
-    Pixels that an occluder hides are black on both sides; pictures that are missing are left out.
+    Measured are all ``views`` of as many of the ``frames``, evenly spread, as make ``MAX_PICTURES`` pictures; the
+    result lists them. Pixels that an occluder hides are black on both sides; pictures that are missing are left out.
     """
+    frames = evenly_spread(frames, MAX_PICTURES // max(len(views), 1))
     scores: list[dict[str, float]] = []
     by_frame: dict[int, list[float]] = {frame: [] for frame in frames}
     for frame in frames:
