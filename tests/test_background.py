@@ -75,6 +75,7 @@ def test_light_that_changes_is_no_object():
     assert (model.mask(0, empty) > 0.5).mean() < 0.01
 
 
+@pytest.mark.slow
 def test_large_pictures_take_little_memory_and_keep_their_outlines():
     """1200 x 960 pixels: learning takes a few float copies of the pictures at most, and a window finds the object."""
     rng = np.random.default_rng(6)

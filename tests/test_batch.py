@@ -142,6 +142,7 @@ def states(out: Path) -> dict[str, str]:
     return {key: row["state"] for key, row in json.loads((out / "batch.json").read_text())["stages"].items()}
 
 
+@pytest.mark.slow
 def test_a_scene_that_fails_does_not_stop_the_others_and_runs_again(tmp_path, broken_scene):
     path = spec_file(tmp_path, scenes=[str(broken_scene), str(BALLS)], evaluate=True)
     out, broken = tmp_path / "out", broken_scene.name

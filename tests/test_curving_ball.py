@@ -95,6 +95,7 @@ def tracks_of_fast_balls(folder):
     return read_tracks(folder)
 
 
+@pytest.mark.slow
 def test_a_drag_that_falls_at_a_critical_reynolds_number_is_named_and_measured(tmp_path):
     tracks = tracks_of_fast_balls(tmp_path)
     config = RefineConfig.model_validate({"effects": ["drag_crisis", "quadratic_drag", "linear_drag", "body_force"]})

@@ -177,6 +177,7 @@ class Drifting(LinearModel):
         self.observations = (replace(own, values=values),)
 
 
+@pytest.mark.slow
 def test_values_of_the_posterior_are_nearer_to_the_truth_than_those_of_least_squares():
     squares, moved = [], []
     for seed in range(10):

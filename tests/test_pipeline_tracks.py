@@ -30,6 +30,7 @@ def effects(run) -> list[dict]:
     return yaml.safe_load((run.path / "twin.yaml").read_text())["effects"]
 
 
+@pytest.mark.slow
 def test_refining_again_gives_the_same_answer_and_the_same_twin(run):
     first = run.refine(RefineRequest(group=True)).data
     twin = effects(run)

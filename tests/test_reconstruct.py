@@ -111,6 +111,7 @@ class States(Checkpoint):
         self.base_motions.append(state()["network"]["base_motion"].clone())
 
 
+@pytest.mark.slow
 def test_frames_that_are_not_in_the_fit_yet_keep_the_base_motion_of_their_hulls():
     scene = dataclasses.replace(filmed(lambda unit, _: 0.2 * unit + np.array([0.0, 0.5, 0.0])), frame_count=30)
     config = CONFIG.model_copy(update={"iterations": 60, "first_frame_fraction": 0.1, "growth_fraction": 0.8})
@@ -219,6 +220,7 @@ def same(one, other):
     )
 
 
+@pytest.mark.slow
 def test_two_processes_end_with_the_numbers_of_one(scene, tmp_path):
     """Through frames that come in, pruning and a resume in the other number of processes."""
     one, two = (CONFIG.model_copy(update={"iterations": 60, "processes": n}) for n in (1, 2))

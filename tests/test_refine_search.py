@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from linear_model import EFFECTS, NOISE, ONES, POINTS, TIMES, LinearModel, baseline, pattern
+from small import only_first_quick
 
 from masiv.errors import InputError, MasivError, NonFiniteError
 from masiv.inference.noise_model import NoiseModel
@@ -34,7 +35,7 @@ def refined(model, config=None, known=(), **changes):
     return refine(model, [baseline(model, known)], settings(config, **changes))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", only_first_quick(range(8)))
 def test_nothing_is_missing_if_nothing_is(seed):
     result = refined(LinearModel({"velocity_z": 0.3}, seed=seed))
     assert (result.verdict, result.accepted, result.changes_twin) == ("nothing missing", (), False)
@@ -53,13 +54,13 @@ def test_a_probable_effect_that_would_not_have_been_seen_leaves_the_question_ope
     assert replace(result, search=search).verdict == verdict
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", only_first_quick(range(4)))
 def test_an_effect_within_the_noise_is_not_named(seed):
     weak = LinearModel({"viscosity.strength": 0.05 * NOISE}, seed=seed)
     assert refined(weak).accepted == ()
 
 
-@pytest.mark.parametrize("discrepancy_force", [False, True])
+@pytest.mark.parametrize("discrepancy_force", only_first_quick([True, False]))
 def test_two_strong_effects_are_found_by_every_kind_of_search(discrepancy_force):
     """A search without a force for the discrepancy, as tracks have it, goes on after the first effect, too."""
     model = LinearModel({**DRAG, **GRAVITY, "velocity_z": 0.3})
@@ -82,6 +83,7 @@ def test_no_more_effects_are_added_than_asked_and_the_rest_is_called_unexplained
     assert text(written).endswith(written["answer"])
 
 
+@pytest.mark.slow
 def test_arguments_stay_as_they_are():
     model = LinearModel({**DRAG, **GRAVITY})
     base, config = baseline(model), settings()
@@ -244,7 +246,7 @@ def noisy(truth, noise, seed):
     )
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", only_first_quick(range(3)))
 def test_what_explains_a_small_part_of_large_errors_is_named_if_it_is_evident(seed):
     """The errors of points average out over the body, its motion does not."""
     model = noisy({"linear_drag.strength": 0.035, "velocity_z": 0.3}, 30 * NOISE, seed)
@@ -287,6 +289,7 @@ def test_noise_is_no_outlier_in_any_observation():
     assert scales[0] == scales[1] >= 5 * 20 * NOISE
 
 
+@pytest.mark.slow
 def test_the_model_before_is_judged_by_the_errors_of_its_own_motion():
     """Also if a further effect was looked for after the first, and rejected."""
     kind = type("Changing", (Grids,), {"factor": 10.0})

@@ -127,6 +127,7 @@ def test_a_rollout_goes_on_from_a_state():
     assert whole.internal_variables.abs().max() > 1
 
 
+@pytest.mark.slow
 def test_gradient_of_a_rollout_of_several_segments():
     x, steps = body(), 100
     sim = simulator(len(x))

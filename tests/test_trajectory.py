@@ -82,6 +82,7 @@ def test_first_frame_is_anchored_and_frames_agree_with_evaluate(scene, dynamic):
     assert np.linalg.norm(np.diff(between, axis=0), axis=-1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_interrupted_and_resumed_is_uninterrupted(scene, dynamic, tmp_path):
     config = CONFIG.model_copy(update={"carve_images": 99, "iterations": 20})
     whole = estimate_trajectory(scene, dynamic, config, seed=3)

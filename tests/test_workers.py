@@ -118,6 +118,7 @@ class Listening(Workers):
         return super().map(function, self.heard[-1], shared=shared)
 
 
+@pytest.mark.slow
 def test_a_tensor_is_copied_to_a_process_and_its_memory_stays_where_it_is(two):
     """A simulation beside may be reading it."""
     given = torch.zeros(3)
@@ -152,6 +153,7 @@ def test_each_process_runs_on_one_thread_and_this_one_as_before(two):
     assert dict(os.environ) == before
 
 
+@pytest.mark.slow
 def test_the_environment_of_this_process_is_never_changed():
     """Not even for a moment: another thread may read it, or start a process of its own."""
     PUTENV.append("listening")
@@ -163,6 +165,7 @@ def test_the_environment_of_this_process_is_never_changed():
         PUTENV.clear()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processes", [1, 2])
 def test_shared_arguments_are_pickled_once(processes):
     with Workers(processes) as workers:
@@ -212,6 +215,7 @@ def test_a_scheduler_that_cannot_be_used_is_bad_input():
         workers_for(0, wide.scheduler_address)
 
 
+@pytest.mark.slow
 def test_an_error_does_not_wait_for_running_tasks(tmp_path):
     def fail():
         with Workers(2) as workers:
@@ -239,6 +243,7 @@ def test_a_task_beside_this_process(processes):
         assert isinstance(failing(), TaskError)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processes", [1, 2])
 def test_processes_begin_before_they_are_asked_for_anything(processes):
     before = len(multiprocessing.active_children())
