@@ -1,8 +1,17 @@
-"""Few particles that stand for many."""
+"""Few particles, or frames, that stand for many."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+
+
+def evenly_spread(values: Sequence[int], count: int) -> list[int]:
+    """``count`` of ``values``, at least one, in their order, with the first and the last; all if there are no more."""
+    if len(values) <= count:
+        return list(values)
+    return [values[k] for k in np.linspace(0, len(values) - 1, max(count, 1)).round().astype(int)]
 
 
 def random_subset(total: int, count: int, seed: int) -> np.ndarray:

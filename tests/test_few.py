@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from masiv.shapes import ShapeSpec, make_body
-from masiv.subsample import kd_tree_subset, random_subset
+from masiv.subsample import evenly_spread, kd_tree_subset, random_subset
 
 
 @given(st.data())
@@ -53,3 +53,18 @@ def test_drawn_at_random_each_once():
     assert (np.diff(chosen) > 0).all()
     np.testing.assert_array_equal(chosen, random_subset(50, 20, seed=3))
     assert not np.array_equal(chosen, random_subset(50, 20, seed=4))
+
+
+@pytest.mark.parametrize(
+    ("values", "count", "kept"),
+    [
+        (range(5), 5, [0, 1, 2, 3, 4]),
+        (range(5), 9, [0, 1, 2, 3, 4]),
+        (range(10, 21), 3, [10, 15, 20]),
+        (range(120), 2, [0, 119]),
+        (range(120), 0, [0]),
+        ((), 4, []),
+    ],
+)
+def test_values_are_spread_from_the_first_to_the_last(values, count, kept):
+    assert evenly_spread(values, count) == kept

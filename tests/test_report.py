@@ -138,21 +138,6 @@ def test_video_and_picture_are_written_whole(tmp_path):
     assert sorted(p.name for p in tmp_path.rglob("*.*")) == ["p.png", "v.mp4"]
 
 
-@pytest.mark.parametrize(
-    ("frames", "count", "kept"),
-    [
-        (range(5), 5, [0, 1, 2, 3, 4]),
-        (range(5), 9, [0, 1, 2, 3, 4]),
-        (range(10, 21), 3, [10, 15, 20]),
-        (range(120), 2, [0, 119]),
-        (range(120), 0, [0]),
-        ((), 4, []),
-    ],
-)
-def test_measured_frames_are_spread_from_the_first_to_the_last(frames, count, kept):
-    assert measure.evenly_spread(frames, count) == kept
-
-
 def test_of_a_large_recording_as_many_pictures_are_measured_as_a_mean_needs(taichi, monkeypatch):
     monkeypatch.setattr(measure, "MAX_PICTURES", 6)
     loaded = []

@@ -32,6 +32,7 @@ from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
 from masiv.splat.dynamic import DynamicGaussians
 from masiv.strict import reason
+from masiv.subsample import evenly_spread
 
 _CHUNK = 8
 """Times that are evaluated together: limits the memory."""
@@ -139,9 +140,8 @@ def known_volume(scene: Scene, config: TrajectoryConfig) -> VolumePrior | None:
     """The prior of the object's volume from hulls of some frames; None if depth or points measure the surface."""
     if scene.load_cloud is not None or scene.depth_noise is not None:
         return None
-    observed = scene.observed_frames
-    chosen = {observed[i] for i in np.linspace(0, len(observed) - 1, min(_HULLS, len(observed))).round().astype(int)}
-    return volume_prior(scene, {k: visual_hull(scene, k, resolution=config.fill_resolution) for k in sorted(chosen)})
+    chosen = evenly_spread(scene.observed_frames, _HULLS)
+    return volume_prior(scene, {k: visual_hull(scene, k, resolution=config.fill_resolution) for k in chosen})
 
 
 def first_mirror(scene: Scene, config: TrajectoryConfig, progress: Progress = silent) -> MirrorPlane | None:

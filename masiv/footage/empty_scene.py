@@ -13,6 +13,7 @@ from masiv.errors import InputError
 from masiv.footage.recordings import PICTURES, VIDEOS, Recording, open_recording
 from masiv.scene.background import largest_components
 from masiv.scene.pictures import image_size
+from masiv.subsample import evenly_spread
 
 MOST_AVERAGED = 100
 """Frames of a clip of the empty scene that are averaged: noise falls to a tenth, below a grey level."""
@@ -82,5 +83,4 @@ def plate_of(folder: Path, recording: Recording) -> np.ndarray:
 
 def spread(indices: Sequence[int]) -> list[int]:
     """At most ``MOST_AVERAGED`` of ``indices``, evenly spread."""
-    count = min(len(indices), MOST_AVERAGED)
-    return [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, count).round().astype(int))]
+    return evenly_spread(indices, MOST_AVERAGED)

@@ -12,6 +12,7 @@ from masiv.hull.carve import VisualHull, visual_hull
 from masiv.hull.silhouette import Silhouette, silhouettes
 from masiv.metrics import mask_iou
 from masiv.scene.scene import Scene
+from masiv.subsample import evenly_spread
 
 _FRAMES, _RESOLUTION = 6, 64
 _OUTLIER, _LEAST_LOSS = 4.0, 0.05
@@ -47,8 +48,7 @@ def mask_quality(scene: Scene) -> MaskQuality:
     """The quality of the masks of ``scene``; views and frames that are held out or without a picture do not count."""
     if not scene.views:  # a recording of point clouds
         return MaskQuality((), np.empty(0), np.empty(0))
-    observed = scene.observed_frames
-    chosen = sorted({observed[i] for i in np.linspace(0, len(observed) - 1, _FRAMES).round().astype(int)})
+    chosen = evenly_spread(scene.observed_frames, _FRAMES)
     scores: dict[int, list[float]] = {view: [] for view in scene.views}
     doubts: dict[int, list[float]] = {view: [] for view in scene.views}
     for frame in chosen:

@@ -9,6 +9,7 @@ from masiv.errors import MasivError
 from masiv.hull.carve import visual_hull
 from masiv.identifiability.motion import ObservedMotion, noise_std
 from masiv.scene.scene import Scene
+from masiv.subsample import evenly_spread
 
 MAX_FRAMES = 16
 """Of which hulls are carved; of a longer recording they are evenly spaced."""
@@ -23,7 +24,7 @@ def scene_motion(scene: Scene, path: tuple[np.ndarray, np.ndarray] | None = None
     path: frames (K,) and the centre (K, 3) [m] in them, if it is known better than by the hulls of a few frames.
     """
     observed = scene.observed_frames
-    frames = sorted({observed[k] for k in np.linspace(0, len(observed) - 1, MAX_FRAMES).round().astype(int)})
+    frames = evenly_spread(observed, MAX_FRAMES)
     found, spacings = {}, []
     volume = None
     for frame in frames:

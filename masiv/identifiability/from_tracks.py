@@ -8,6 +8,7 @@ import numpy as np
 
 from masiv.identifiability.motion import ObservedMotion, noise_std
 from masiv.observations.tracks import MIN_NOISE
+from masiv.subsample import evenly_spread
 from masiv.tracks.tracks import Run, Tracks
 
 MOST_MARKERS = 12
@@ -20,8 +21,7 @@ def observed_markers(tracks: Tracks, run: Run) -> tuple[tuple[int, ...], np.ndar
     places (T, M, 3) [m], 0 along axes that were not measured, and times (T,) [s since the release, or the start]."""
     moving, body = run.moving(), tracks.bodies[run.body]
     chosen = body.free_markers(run) or tuple(np.flatnonzero(run.axes.any(axis=1)).tolist())
-    if len(chosen) > MOST_MARKERS:
-        chosen = tuple(chosen[k] for k in np.linspace(0, len(chosen) - 1, MOST_MARKERS).round().astype(int))
+    chosen = tuple(evenly_spread(chosen, MOST_MARKERS))
     whole = moving.seen[:, list(chosen)].all(axis=1)
     return chosen, np.nan_to_num(moving.positions[whole][:, list(chosen)]), moving.elapsed[whole]
 

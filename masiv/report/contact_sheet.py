@@ -13,6 +13,7 @@ import numpy as np
 from masiv.report.media import write_png
 from masiv.report.world_marks import ARROW, GRID, draw_world
 from masiv.scene.scene import Scene
+from masiv.subsample import evenly_spread
 
 OUTLINE = (255, 60, 0)
 HIDDEN = (90, 90, 200)
@@ -38,7 +39,7 @@ def contact_sheet(
 
     notes: what is written into the first picture of a view. marks: drawn into every picture.
     """
-    frames = np.unique(np.linspace(0, scene.frame_count - 1, min(columns, scene.frame_count)).round().astype(int))
+    frames = evenly_spread(range(scene.frame_count), columns)
     if scene.load_cloud is not None:
         return _clouds(scene, frames, tile, marks)
     rows = [

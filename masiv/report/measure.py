@@ -16,6 +16,7 @@ from masiv.report.draw import draw, on_black
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.subdivide import merge_subparticles
 from masiv.splat.gaussians import Gaussians
+from masiv.subsample import evenly_spread
 
 MIN_TRUE_PARTICLES = 8
 """As many as the neighbours from which a true displacement is interpolated."""
@@ -24,7 +25,7 @@ _OTHER_SIZE = 5.0
 of length is a factor of ten away."""
 MAX_PICTURES = 400
 """Pictures that a mean is of, at most. Of 400 independent ones it has a standard error of a twentieth of their scatter;
-large recordings have thousands, and a picture of two megapixels takes a second."""
+large recordings have thousands, and a picture of two megapixels takes seconds."""
 UNITS = {
     "psnr_db": "dB, whole picture, object on black",
     "psnr_box_db": "dB, box of the observed mask, object on black",
@@ -38,13 +39,6 @@ UNITS = {
     "tracked_error_mm": "mm, mean distance to the true displacement",
     "seconds": "s",
 }
-
-
-def evenly_spread(values: Sequence[int], count: int) -> list[int]:
-    """``count`` of ``values``, at least one, with the first and the last; all if there are no more."""
-    if len(values) <= count:
-        return list(values)
-    return [values[k] for k in np.linspace(0, len(values) - 1, max(count, 1)).round().astype(int)]
 
 
 def picture_numbers(

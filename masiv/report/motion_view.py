@@ -10,7 +10,7 @@ import numpy as np
 
 from masiv.report.page import encoded
 from masiv.scene.scene import Ground
-from masiv.subsample import kd_tree_subset
+from masiv.subsample import evenly_spread, kd_tree_subset
 
 MAX_POINTS = 2000
 MAX_INSTANTS = 60
@@ -53,7 +53,7 @@ class Motion:
 
 def shown_instants(count: int) -> np.ndarray:
     """Indices of at most MAX_INSTANTS of ``count`` instants, the first and the last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, MAX_INSTANTS)).round().astype(int))
+    return np.array(evenly_spread(range(count), MAX_INSTANTS), dtype=int)
 
 
 def motion_data(motions: Sequence[Motion], up: np.ndarray, ground: Ground | None) -> dict[str, Any]:

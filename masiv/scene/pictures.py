@@ -19,6 +19,7 @@ from masiv.scene.lens import Lens
 from masiv.scene.picture_file import png_size, read_raw
 from masiv.scene.scene import Frame
 from masiv.scene.segmenter import Prompt, Segmentation, VideoSegmenter
+from masiv.subsample import evenly_spread
 
 OCCLUDER_ALPHA = 50
 MAX_LEARNT, MAX_LEARNT_A_VIEW = 48, 6
@@ -236,10 +237,7 @@ class Pictures:
         found = self._frames_of("background", "segmenter")
         frames = {view: known for view, known in found.items() if view in self.backgrounds and view not in self.boxes}
         count = min(MAX_LEARNT_A_VIEW, max(2, MAX_LEARNT // len(frames)))
-        chosen = {
-            view: [known[i] for i in np.unique(np.linspace(0, len(known) - 1, count).round().astype(int))]
-            for view, known in frames.items()
-        }
+        chosen = {view: evenly_spread(known, count) for view, known in frames.items()}
         images = {
             view: [self._read(view, self.paths[view, frame])[..., :3] for frame in known]
             for view, known in chosen.items()
