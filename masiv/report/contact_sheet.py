@@ -3,7 +3,7 @@ clouds from two sides."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def contact_sheet(
     if scene.load_cloud is not None:
         return _clouds(scene, frames, tile, marks)
     rows = [
-        np.concatenate([_tile(scene, view, int(frame), tile, marks) for frame in frames], axis=1)
+        np.concatenate([_tile(scene, view, frame, tile, marks) for frame in frames], axis=1)
         for view in scene.views
     ]
     for row, view in zip(rows, scene.views, strict=True):
@@ -54,7 +54,7 @@ def contact_sheet(
     return np.concatenate(rows, axis=0)
 
 
-def _clouds(scene: Scene, frames: np.ndarray, tile: int, marks: Marks | None) -> np.ndarray:
+def _clouds(scene: Scene, frames: Sequence[int], tile: int, marks: Marks | None) -> np.ndarray:
     """A row for each of two horizontal directions, ``up`` upwards; darker where there are more points."""
     clouds = [scene.cloud(int(frame)).points for frame in frames]
     seed = np.eye(3)[np.argmin(np.abs(scene.up))]
