@@ -43,8 +43,7 @@ def contact_sheet(
     if scene.load_cloud is not None:
         return _clouds(scene, frames, tile, marks)
     rows = [
-        np.concatenate([_tile(scene, view, frame, tile, marks) for frame in frames], axis=1)
-        for view in scene.views
+        np.concatenate([_tile(scene, view, frame, tile, marks) for frame in frames], axis=1) for view in scene.views
     ]
     for row, view in zip(rows, scene.views, strict=True):
         if notes and view in notes:
