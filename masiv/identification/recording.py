@@ -25,11 +25,13 @@ class FitRecording:
 
     @cached_property
     def frames(self) -> int:
-        """Frames after frame 0 that the fit simulates: until the observed body is at rest.
+        """Frames after frame 0 that the fit simulates: those until the observed body is at rest, and as many at rest.
 
-        Frames at rest show one shape again and again, and the gradient through them is long.
+        More frames at rest would outweigh the motion, show one shape again and again, and make the gradient long; with
+        none, a fit hardly sees the shape in which the body ends.
         """
-        return self.objective.problem.moving_frames
+        problem = self.objective.problem
+        return min(problem.frames, 2 * problem.moving_frames)
 
 
 def prepare_recording(
