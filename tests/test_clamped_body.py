@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from masiv.effects.catalogue import effects
 from masiv.errors import NonFiniteError
 from masiv.identification.tracks import clamped_body_model
 from masiv.inference.model_fit import gauss_newton_fit
@@ -101,6 +102,17 @@ def test_effects_that_are_not_simulated_are_not_offered(bar):
     assert {"linear_drag", "restitution", "point_mass"} <= set(offered)
     assert not {"time_offset", "ground_height"} & set(offered)
     assert "restitution" not in model_of(bar, None).candidates(MODEL)
+
+
+@pytest.mark.parametrize("name", [name for name, effect in effects().items() if effect.hints.inside])
+def test_guesses_of_places_in_the_body_are_possible_values(bar, name):
+    """A load that hangs from the very face, half a spacing outside of the outermost particles, too."""
+    term = model_of(bar, None).term(name)
+    lower, upper = np.array([(p.lower, p.upper) for p in term.others]).T
+    guesses = np.array(term.guesses)
+    assert len(guesses)
+    assert (guesses >= lower - 1e-9).all()
+    assert (guesses <= upper + 1e-9).all()
 
 
 def test_shapes_that_do_not_fit_are_refused(bar):

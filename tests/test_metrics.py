@@ -71,22 +71,45 @@ def test_psnr_of_a_known_error_and_scale():
     assert metrics.psnr(np.full((5, 6, 3), 0.2), black) == pytest.approx(20 * np.log10(5))
 
 
-def test_ssim_against_a_direct_sum():
-    rng = np.random.default_rng(4)
-    a, b = rng.random((2, 14, 13, 1))
+def pictures(rows, columns):
+    """Two (34, 13, 1) that are black but for ``rows`` and ``columns``."""
+    found = np.zeros((2, 34, 13, 1))
+    content = found[:, rows, columns]
+    content[:] = np.random.default_rng(4).random(content.shape)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [
+        (slice(None), slice(None)),
+        (slice(20, 24), slice(None)),
+        (slice(0, 3), slice(10, 13)),
+        (slice(16, 17), slice(6, 7)),
+    ],
+)
+def test_ssim_and_psnr_against_direct_sums(rows, columns):
+    """Also where most of both pictures is black."""
+    a, b = pictures(rows, columns)
     offsets = np.arange(-5, 6)
     kernel = np.exp(-(offsets**2) / (2 * 1.5**2))
     kernel = np.outer(kernel, kernel) / kernel.sum() ** 2
 
     def mean(picture):
         padded = np.pad(picture[..., 0], 5)
-        return np.array([[(kernel * padded[i : i + 11, j : j + 11]).sum() for j in range(13)] for i in range(14)])
+        return np.array([[(kernel * padded[i : i + 11, j : j + 11]).sum() for j in range(13)] for i in range(34)])
 
     ma, mb = mean(a), mean(b)
     va, vb, cov = mean(a * a) - ma**2, mean(b * b) - mb**2, mean(a * b) - ma * mb
     expected = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
     assert metrics.ssim(a, b) == pytest.approx(expected.mean(), abs=1e-12)
     assert metrics.ssim(a, a) == pytest.approx(1)
+    assert metrics.psnr(a, b) == pytest.approx(-10 * np.log10(((a - b) ** 2).mean()))
+
+
+def test_black_pictures_are_alike():
+    black = np.zeros((4, 5, 3), np.uint8)
+    assert metrics.ssim(black, black) == 1
 
 
 def test_box_scores_look_only_at_the_mask():

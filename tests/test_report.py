@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
-from masiv.report import history, measure
+from masiv.report import history, measure, pictures
 from masiv.report.draw import backdrop, draw
 from masiv.report.follow import Binding
 from masiv.report.media import write_png, write_video
@@ -139,7 +139,7 @@ def test_video_and_picture_are_written_whole(tmp_path):
 
 
 def test_of_a_large_recording_as_many_pictures_are_measured_as_a_mean_needs(taichi, monkeypatch):
-    monkeypatch.setattr(measure, "MAX_PICTURES", 6)
+    monkeypatch.setattr(pictures, "MAX_PICTURES", 6)
     loaded = []
 
     def load(view, frame):
@@ -153,11 +153,18 @@ def test_of_a_large_recording_as_many_pictures_are_measured_as_a_mean_needs(taic
     )  # fmt: skip
     points = cloud()
     drawn = Gaussians(points.means.float(), points.scales.float(), points.opacities, points.colours)
-    numbers = measure.picture_numbers(scene, lambda _: drawn, [0, 1], list(range(9)))
+    scores = pictures.score_pictures(scene, {"one": lambda _: drawn, "same": lambda _: drawn}, list(range(9)))
+    assert scores["one"].by_picture == scores["same"].by_picture
+    numbers = scores["one"].mean([0, 1], list(range(9)))
     assert numbers is not None
     assert numbers["frames"] == [0, 4, 8]
     assert len(numbers["psnr_box_db_by_frame"]) == 3
-    assert sorted(set(loaded)) == [(v, f) for v in (0, 1) for f in (0, 4, 8)]
+    assert sorted(loaded) == [(v, f) for v in (0, 1) for f in (0, 4, 8)]  # once for both
+    alone = scores["one"].mean([1], [4])
+    assert alone is not None
+    assert (alone["views"], alone["frames"]) == ([1], [4])
+    assert alone["psnr_db"] == scores["one"].by_picture[1, 4]["psnr_db"]
+    assert scores["one"].mean([], [4]) is None
 
 
 def test_truth_and_motion_numbers(tmp_path):

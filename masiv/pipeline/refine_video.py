@@ -146,7 +146,7 @@ def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: P
         stages.describe_material(run, twin, progress)
     numbers = stages.read_metrics(run)
     if numbers is None:
-        numbers = run_numbers(run, scene, dynamic, trajectory, rollout) | material_numbers(run)
+        numbers = run_numbers(run, scene, dynamic, trajectory, rollout, progress=progress) | material_numbers(run)
         write_json(run.metrics, numbers)
     write_report(run, scene, dynamic, trajectory, twin, rollout, numbers)
     progress("report", 1, 1)
@@ -159,18 +159,18 @@ def _picture_errors(
     """Chamfer to the ``motion`` that was followed, and pictures against the video, over the frames of each part of
     ``observation``."""
     from masiv import metrics
-    from masiv.report import measure
     from masiv.report.follow import Binding
+    from masiv.report.pictures import score_pictures
 
     binding = Binding.at_rest(dynamic.at(0.0), positions[0])
     views = list(range(len(scene.cameras)))
     out: dict[str, dict[str, Any]] = {}
     samples = observation.samples_per_frame
-    for done, (split, part) in enumerate(observation.parts.items()):
+    for split, part in observation.parts.items():
         frames = list(range(1 + part.start // samples, 1 + part.stop // samples))
-        numbers = measure.picture_numbers(scene, lambda f: binding.moved(positions[f]), views, frames) or {}
+        scores = score_pictures(scene, {"twin": lambda f: binding.moved(positions[f])}, frames, progress=progress)
+        numbers = scores["twin"].mean(views, frames) or {}
         kept = {k: numbers[k] for k in ("psnr_db", "psnr_box_in_scene_db", "ssim", "mask_iou") if k in numbers}
         chamfer = [metrics.chamfer_1e3mm2(positions[f], motion.positions[f]) for f in frames]
         out[split] = {"frames": frames, "chamfer_1e3mm2": float(np.mean(chamfer)), **kept}
-        progress("refine: pictures", done + 1, len(observation.parts))
     return out

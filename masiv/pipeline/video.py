@@ -94,7 +94,7 @@ class VideoRun(Run):
             dynamic = stages.ensure_gaussians(self.folder, self.config, self.scene, progress)
         from masiv.report.numbers import reconstruction_numbers, table
 
-        numbers = reconstruction_numbers(self.folder, self.scene, dynamic)
+        numbers = reconstruction_numbers(self.folder, self.scene, dynamic, progress=progress)
         data = {
             "run": str(self.path),
             "gaussians": len(dynamic.canonical),
@@ -150,9 +150,7 @@ class VideoRun(Run):
         with stages.material_description(folder, self.config, twin):
             rollout = simulate(twin, frames=scene.frame_count, fps=scene.fps, progress=progress)
             rollout.save(folder.rollout)
-            progress("measure pictures", 0, 1)
-            numbers = run_numbers(folder, scene, dynamic, trajectory, rollout.positions)
-            progress("measure pictures", 1, 1)
+            numbers = run_numbers(folder, scene, dynamic, trajectory, rollout.positions, progress=progress)
         numbers |= material_numbers(folder)
         write_json(folder.metrics, numbers)
         progress("report", 0, 1)

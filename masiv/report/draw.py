@@ -16,6 +16,12 @@ TILE_LIGHT, TILE_DARK = np.array([205.0, 200, 190]), np.array([175.0, 170, 160])
 
 def draw(gaussians: Gaussians, camera: Camera, background: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The picture (H, W, 3) uint8 and its alpha (H, W) float32; over ``background`` (H, W, 3) uint8, or black."""
+    colours, alpha = drawn(gaussians, camera)
+    return over(colours, alpha, background), alpha
+
+
+def drawn(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (H, W, 3) times alpha, of 255, and alpha (H, W), float32."""
     with torch.no_grad():
         rendered = render(
             camera,
@@ -25,11 +31,14 @@ def draw(gaussians: Gaussians, camera: Camera, background: np.ndarray | None = N
             gaussians.colours,
             torch.zeros(3, dtype=gaussians.means.dtype),
         )
-    alpha = rendered.alpha.numpy()
-    picture = rendered.rgb.numpy() * 255.0
+    return rendered.rgb.numpy() * 255.0, rendered.alpha.numpy()
+
+
+def over(colours: np.ndarray, alpha: np.ndarray, background: np.ndarray | None = None) -> np.ndarray:
+    """What was ``drawn`` over ``background`` (H, W, 3) uint8, or black: (H, W, 3) uint8 (Porter & Duff 1984)."""
     if background is not None:
-        picture = picture + (1.0 - alpha)[..., None] * background
-    return np.clip(np.round(picture), 0, 255).astype(np.uint8), alpha
+        colours = colours + (1.0 - alpha)[..., None] * background
+    return np.clip(np.round(colours), 0, 255).astype(np.uint8)
 
 
 def backdrop(camera: Camera, up: np.ndarray, ground: Ground | None, tile: float) -> np.ndarray:

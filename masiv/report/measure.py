@@ -12,20 +12,15 @@ import numpy as np
 from masiv import metrics
 from masiv.errors import InputError
 from masiv.files import read_npy
-from masiv.report.draw import draw, on_black
 from masiv.scene.scene import Ground, Scene
 from masiv.simulation.subdivide import merge_subparticles
 from masiv.splat.gaussians import Gaussians
-from masiv.subsample import evenly_spread
 
 MIN_TRUE_PARTICLES = 8
 """As many as the neighbours from which a true displacement is interpolated."""
 _OTHER_SIZE = 5.0
 """Ratio of sizes from which on two bodies are not one: a reconstruction is within tens of per cent, and the next unit
 of length is a factor of ten away."""
-MAX_PICTURES = 400
-"""Pictures that a mean is of, at most. Of 400 independent ones it has a standard error of a twentieth of their scatter;
-large recordings have thousands, and a picture of two megapixels takes seconds."""
 UNITS = {
     "psnr_db": "dB, whole picture, object on black",
     "psnr_box_db": "dB, box of the observed mask, object on black",
@@ -39,47 +34,6 @@ UNITS = {
     "tracked_error_mm": "mm, mean distance to the true displacement",
     "seconds": "s",
 }
-
-
-def picture_numbers(
-    scene: Scene, gaussians_at: Callable[[int], Gaussians], views: Sequence[int], frames: Sequence[int]
-) -> dict[str, Any] | None:
-    """Mean PSNR, SSIM and mask IoU of drawn Gaussians against the observed object, or None without view or frame.
-
-    Measured are all ``views`` of as many of the ``frames``, evenly spread, as make ``MAX_PICTURES`` pictures; the
-    result lists them. Pixels that an occluder hides are black on both sides; pictures that are missing are left out.
-    """
-    frames = evenly_spread(frames, MAX_PICTURES // max(len(views), 1))
-    scores: list[dict[str, float]] = []
-    by_frame: dict[int, list[float]] = {frame: [] for frame in frames}
-    for frame in frames:
-        gaussians = gaussians_at(frame)
-        for view in views:
-            observed = scene.frame(view, frame)
-            if not observed.valid.any():
-                continue
-            image, alpha = draw(gaussians, scene.cameras[view])
-            reference = on_black(observed.image, observed.mask * observed.valid)
-            image[~observed.valid] = 0
-            score = metrics.picture_scores(image, reference, observed.mask)
-            plate = scene.background(view)
-            if plate is not None and (box := metrics.mask_box(observed.mask)) is not None:
-                # On black, half a pixel of outline outweighs all that is inside of it; a viewer sees the object in its
-                # scene.
-                placed, _ = draw(gaussians, scene.cameras[view], plate)
-                share = (observed.mask * observed.valid)[..., None]
-                seen = np.round(observed.image * share + plate * (1 - share)).astype(np.uint8)
-                placed[~observed.valid] = seen[~observed.valid]
-                score["psnr_box_in_scene_db"] = metrics.psnr(placed[box], seen[box])
-            score["mask_iou"] = metrics.mask_iou(alpha * observed.valid, observed.mask * observed.valid)
-            scores.append(score)
-            by_frame[frame].append(score.get("psnr_box_db", np.nan))
-    if not scores:
-        return None
-    names = sorted({name for score in scores for name in score})
-    means = {name: float(np.mean([score[name] for score in scores if name in score])) for name in names}
-    curve = {"psnr_box_db_by_frame": [float(np.mean(by_frame[frame])) if by_frame[frame] else None for frame in frames]}
-    return {"views": list(views), "frames": list(frames), **means, **curve}
 
 
 def cloud_numbers(

@@ -13,6 +13,7 @@ from masiv import metrics
 from masiv.progress import Progress, silent
 from masiv.report import measure
 from masiv.report.follow import Binding
+from masiv.report.pictures import GaussiansAt, PictureScores, score_pictures
 from masiv.report.sections.material import read_material
 from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
@@ -28,32 +29,49 @@ def _views(run: RunFolder, scene: Scene) -> tuple[list[int], list[int]]:
     return [view for view in range(len(scene.cameras)) if view not in held_out], held_out
 
 
-def reconstruction_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussians) -> dict[str, Any]:
+def reconstruction_numbers(
+    run: RunFolder, scene: Scene, dynamic: DynamicGaussians, *, progress: Progress = silent
+) -> dict[str, Any]:
     """Pictures of the Gaussians on the fitted frames, seen and held-out cameras apart; or point clouds."""
     frames = list(range(run.fit_frames))
+    at = _reconstruction(scene, dynamic)
     if scene.load_cloud is not None:
-        return {"point_clouds": measure.cloud_numbers(scene, lambda f: dynamic.at(f / scene.fps), frames)}
-    training, held_out = _views(run, scene)
-    return {
-        name: measure.picture_numbers(scene, lambda f: dynamic.at(f / scene.fps), views, frames)
-        for name, views in (("training_views", training), ("held_out_views", held_out))
-    }
+        return {"point_clouds": measure.cloud_numbers(scene, at, frames)}
+    scores = score_pictures(scene, {"reconstruction": at}, frames, progress=progress)["reconstruction"]
+    return _by_cameras(run, scene, scores, frames)
 
 
-def twin_numbers(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout: np.ndarray) -> dict[str, Any]:
-    """Pictures of the Gaussians moved by the twin's particles, over fitted and future frames, on every camera; or point
-    clouds."""
+def both_numbers(
+    run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout: np.ndarray, *, progress: Progress = silent
+) -> dict[str, dict[str, Any]]:
+    """``reconstruction_numbers`` as "reconstruction". As "twin" pictures of the Gaussians moved by the twin's
+    particles, over fitted and future frames, on every camera; or point clouds."""
     binding = Binding.at_rest(dynamic.at(0.0), rollout[0])
+    splits = dict(_split(run))
+    twin = {"twin": lambda f: binding.moved(rollout[f])}
     if scene.load_cloud is not None:
-        return {
-            name: measure.cloud_numbers(scene, lambda f: binding.moved(rollout[f]), frames)
-            for name, frames in _split(run)
-        }
+        clouds = {split: measure.cloud_numbers(scene, twin["twin"], frames) for split, frames in splits.items()}
+        return {"reconstruction": reconstruction_numbers(run, scene, dynamic), "twin": clouds}
+    models = {"reconstruction": _reconstruction(scene, dynamic), **twin}
+    observed = score_pictures(scene, models, splits["observed"], progress=progress)
+    future = score_pictures(scene, twin, splits["future"], progress=progress)
     views = list(range(len(scene.cameras)))
     return {
-        name: measure.picture_numbers(scene, lambda f: binding.moved(rollout[f]), views, frames)
-        for name, frames in _split(run)
+        "reconstruction": _by_cameras(run, scene, observed["reconstruction"], splits["observed"]),
+        "twin": {
+            split: scores["twin"].mean(views, splits[split])
+            for split, scores in (("observed", observed), ("future", future))
+        },
     }
+
+
+def _reconstruction(scene: Scene, dynamic: DynamicGaussians) -> GaussiansAt:
+    return lambda frame: dynamic.at(frame / scene.fps)
+
+
+def _by_cameras(run: RunFolder, scene: Scene, scores: PictureScores, frames: Sequence[int]) -> dict[str, Any]:
+    training, held_out = _views(run, scene)
+    return {"training_views": scores.mean(training, frames), "held_out_views": scores.mean(held_out, frames)}
 
 
 def _split(run: RunFolder) -> tuple[tuple[str, list[int]], ...]:
@@ -64,14 +82,14 @@ def _split(run: RunFolder) -> tuple[tuple[str, list[int]], ...]:
 
 
 def run_numbers(
-    run: RunFolder, scene: Scene, dynamic: DynamicGaussians, trajectory: Trajectory, rollout: np.ndarray
-) -> dict[str, Any]:
+    run: RunFolder, scene: Scene, dynamic: DynamicGaussians, trajectory: Trajectory, rollout: np.ndarray, *,
+    progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
     """metrics.json of ``masiv identify`` but for ``material_numbers``: no ground truth is needed."""
     return {
         "schema": 1,
         "units": measure.UNITS,
-        "reconstruction": reconstruction_numbers(run, scene, dynamic),
-        "twin": twin_numbers(run, scene, dynamic, rollout),
+        **both_numbers(run, scene, dynamic, rollout, progress=progress),
         "fit": measure.agreement(rollout, trajectory.positions),
         "trajectory": {
             "particles": int(trajectory.positions.shape[1]),
@@ -136,6 +154,11 @@ def evaluation_numbers(
         }
     progress("evaluate", len(motions), len(motions))
     floor = [metrics.chamfer_floor(points, seed=seed) for points in truth]
+    pictures: dict[str, Any] = {"reconstruction": None, "twin": None}
+    if scene is not None and rollout is not None:
+        pictures = both_numbers(run, scene, dynamic, rollout, progress=progress)
+    elif scene is not None:
+        pictures["reconstruction"] = reconstruction_numbers(run, scene, dynamic, progress=progress)
     return {
         "schema": 1,
         "units": measure.UNITS,
@@ -143,8 +166,7 @@ def evaluation_numbers(
         "chamfer_floor_1e3mm2": float(np.mean(floor)),
         "baseline_start": {"velocity_m_s": velocity.tolist(), "omega_rad_s": omega.tolist()},
         "motion": motion,
-        "reconstruction": None if scene is None else reconstruction_numbers(run, scene, dynamic),
-        "twin": None if scene is None or rollout is None else twin_numbers(run, scene, dynamic, rollout),
+        **pictures,
     }
 
 
