@@ -323,6 +323,7 @@ def reprojection(scene, exact, cameras):
     return np.sqrt((left**2).reshape(-1, 2).sum(axis=1).mean())
 
 
+@pytest.mark.slow
 def test_perturbed_cameras_are_found_again():
     """Seven views of the textured ball, each turned and shifted so that the ball is about a pixel off."""
     scene = filmed(truth)

@@ -49,6 +49,7 @@ def tracks_of_curving_balls(folder):
     return read_tracks(folder)
 
 
+@pytest.mark.slow
 def test_the_lift_of_spinning_balls_is_named_and_measured(tmp_path):
     tracks = tracks_of_curving_balls(tmp_path)
     config = RefineConfig.model_validate({"effects": ["magnus", "body_force", "quadratic_drag", "linear_drag"]})

@@ -12,7 +12,7 @@ from linear_model import FITTED as FITTED_INSTANTS
 from linear_model import POINTS, TIMES, baseline
 from pushed_points import PushedPoints
 from scipy.stats import multivariate_normal
-from small import SMALL
+from small import SMALL, only_first_quick
 
 from masiv.errors import NonFiniteError
 from masiv.identification.config import IdentifyConfig
@@ -50,7 +50,7 @@ def cosine(a, b):
     return float((a * b).sum() / np.linalg.norm(a) / np.linalg.norm(b))
 
 
-@pytest.mark.parametrize("axes", [None, TILTED])
+@pytest.mark.parametrize("axes", only_first_quick([TILTED, None]))
 def test_a_gust_is_found_where_when_and_along_what_it_blew(axes):
     model = PushedPoints(gust, axes)
     start = model.rollouts
@@ -108,6 +108,7 @@ class Fragile(PushedPoints):
         return super().fields(model, values, held_out=held_out)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_simulated_has_no_force():
     model = Fragile(gust)
     result = refine(model, [baseline(model)], SETTINGS)

@@ -146,6 +146,7 @@ def with_test(model, count):
     return model.with_observations([replace(own, test_count=count)])
 
 
+@pytest.mark.slow
 def test_what_is_expected_of_the_test_is_found_there():
     found, expected = [], []
     for seed in range(8):

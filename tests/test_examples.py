@@ -44,6 +44,7 @@ def test_stress_strain(tmp_path):
     assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_gradient_of_a_rollout():
     gradient, difference = script("gradient_of_a_rollout").main()
     assert gradient == pytest.approx(difference, rel=1e-5)

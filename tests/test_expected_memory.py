@@ -93,6 +93,7 @@ def test_a_stage_that_does_not_fit_says_what_to_change():
         memory.require(200, lambda: 1e6)
 
 
+@pytest.mark.slow
 def test_what_simulators_reserve_is_what_a_process_takes():
     particles, substeps, nodes, chunks = 5000, 256, 1 << 18, 2
     code = f"""

@@ -127,6 +127,7 @@ def test_new_frames_are_followed_and_known_ones_stay(extended, fitted):
         assert frame < FRAMES - 1 or error < 0.5 * rigid
 
 
+@pytest.mark.slow
 def test_resumed_pass_ends_with_the_same_numbers(scene, fitted, extended, tmp_path):
     checkpoint = Checkpoint(tmp_path / "state.pt", every_s=0.0)
 
@@ -162,6 +163,7 @@ def test_without_a_further_frame_there_is_nothing_to_follow(scene, fitted, exten
         extend_trajectory(scene, fitted, particles, TRAJECTORY)
 
 
+@pytest.mark.slow
 def test_a_run_measures_its_held_out_frames_once(scene, fitted, particles, tmp_path):
     quick, coarse = CONFIG.model_copy(update={"iterations": 20}), TRAJECTORY.model_copy(update={"iterations": 2})
     settings = Config(reconstruct=quick, trajectory=coarse)

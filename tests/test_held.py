@@ -118,6 +118,7 @@ def test_a_fall_in_a_thick_medium_is_free():
     assert held_in(oil, run) is None
 
 
+@pytest.mark.slow
 def test_every_command_says_that_a_pendulum_is_held(tmp_path):
     """Tracks of a bob, declared as a ball in flight: a body force is found, and what it means is said."""
     random, times, runs = np.random.default_rng(9), np.arange(60) / 60, []

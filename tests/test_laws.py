@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from law_examples import EXAMPLES, F64, gradients
 from scipy.spatial.transform import Rotation
-from small import NODES, SUBSTEPS
+from small import NODES, SUBSTEPS, only_first_quick
 
 from masiv.errors import InputError
 from masiv.kernels.lattice import LATTICE_COUNTS, LATTICE_STEP
@@ -295,7 +295,7 @@ SQUEEZES = {
 }
 
 
-@pytest.mark.parametrize("squeeze", SQUEEZES.values(), ids=SQUEEZES)
+@pytest.mark.parametrize("squeeze", only_first_quick(SQUEEZES.values()))
 @pytest.mark.parametrize("material", list(MATERIALS))
 def test_pretrained_law_resembles_its_material(material, squeeze):
     kind, parameters = MATERIALS[material]
@@ -363,6 +363,7 @@ def test_each_scale_of_a_neural_law_moves_what_it_is_named_after():
             torch.testing.assert_close(column, torch.full_like(column, value), atol=0.05, rtol=0.0)
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_a_maxwell_fluid_is_newtonian_in_slow_shear():
     """Simple shear at a rate of 1/s: stress is viscosity times rate, and stays there; pressure is of the volume."""

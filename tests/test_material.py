@@ -111,6 +111,7 @@ def test_a_frozen_law_computes_its_tables_and_coefficients_once():
 # ---- description ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("material", only_first_quick(MATERIALS))
 def test_a_classical_law_is_its_own_family_with_its_own_parameters(material):
     found = describe(classical(material), SEEN)
@@ -147,6 +148,7 @@ def test_a_viscous_fluid_gives_back_its_viscosity():
     assert found.families[0].kind == "newtonian"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("material", only_first_quick(["plasticine", "jelly", "water"]))
 def test_pretrained_laws_are_what_they_were_taught(material):
     found = describe(pretrained(material), SEEN)

@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from masiv.memory import PeakMemory, taken_bytes
 
@@ -11,6 +12,7 @@ LARGE = 200_000_000
 """[bytes]"""
 
 
+@pytest.mark.slow
 def test_a_peak_that_is_over_counts():
     before = taken_bytes()
     with PeakMemory(interval=0.02) as memory:

@@ -70,6 +70,7 @@ def test_the_motion_at_the_missing_frame_is_between_the_others(result):
     assert errors[2] < 1.2 * max(errors[1], errors[3]), errors
 
 
+@pytest.mark.slow
 def test_the_trajectory_has_the_missing_frame(result):
     config = TrajectoryConfig(particle_count=150, fill_resolution=24, iterations=40)
     found = estimate_trajectory(without([2]), result, config)
@@ -79,6 +80,7 @@ def test_the_trajectory_has_the_missing_frame(result):
     assert np.linalg.norm(centre[2] - centre[0] - shift) < 0.015
 
 
+@pytest.mark.slow
 def test_a_fit_continues_over_a_missing_frame(result):
     """The first new frame has no picture."""
     scene = without([2], 4)

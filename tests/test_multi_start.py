@@ -82,6 +82,7 @@ def test_if_every_fit_diverges_the_stage_says_so(seen, monkeypatch):
         fit(seen, monkeypatch, {"maxwell_fluid": 0.1, "plasticine": 0.12}, {"maxwell_fluid": None, "plasticine": None})
 
 
+@pytest.mark.slow
 def test_the_second_of_two_fits_goes_on_where_it_was_killed(seen, tmp_path):
     class Stop(Exception):
         pass

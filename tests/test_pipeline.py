@@ -98,6 +98,7 @@ def killed_in(stage, run, arguments):
     assert ended.returncode == -signal.SIGKILL, ended.stderr
 
 
+@pytest.mark.slow
 def test_killed_fit_of_tracks_ends_with_the_numbers_of_a_whole_one(tmp_path):
     scene = Path(__file__).parent / "golden/balls"
     whole, broken = (("identify", scene, "--out", tmp_path / name) for name in ("whole", "broken"))

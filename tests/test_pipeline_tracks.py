@@ -41,6 +41,7 @@ def test_refining_again_gives_the_same_answer_and_the_same_twin(run):
     assert effects(run) == twin
 
 
+@pytest.mark.slow
 def test_an_answer_without_effects_restores_the_identified_twin(run, tmp_path):
     identified = effects(run)
     run.refine(RefineRequest(group=True))
@@ -52,6 +53,7 @@ def test_an_answer_without_effects_restores_the_identified_twin(run, tmp_path):
     assert effects(run) == identified
 
 
+@pytest.mark.slow
 def test_a_dry_run_leaves_an_earlier_result_alone(run):
     run.refine(RefineRequest(group=True))
     kept = {name: (run.path / name).read_bytes() for name in ("refine.json", "refine.npz", "twin.yaml", "report.html")}

@@ -259,6 +259,7 @@ def test_a_second_process_that_dies_is_told_of_and_none_is_left(scene, monkeypat
     assert started[0].returncode is not None
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="the system does not show a process's environment")
 def test_the_second_process_keeps_the_module_path_of_this_one(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/of/the/user")
@@ -270,6 +271,7 @@ def test_the_second_process_keeps_the_module_path_of_this_one(monkeypatch):
     assert b"PYTHONPATH=/of/the/user" in environment.split(b"\0")
 
 
+@pytest.mark.slow
 def test_what_the_second_process_cannot_draw_is_told_of(scene):
     """The picture that it is given has a camera of no number."""
     nowhere = dataclasses.replace(scene.cameras[0], world_to_camera=np.full((4, 4), np.nan))
@@ -291,6 +293,7 @@ def test_what_the_second_process_cannot_draw_is_told_of(scene):
     assert process.returncode == 0
 
 
+@pytest.mark.slow
 def test_state_of_another_run_is_not_used(scene, tmp_path):
     short = CONFIG.model_copy(update={"iterations": 3})
     checkpoint = Checkpoint(tmp_path / "state.pt", every_s=0.0)

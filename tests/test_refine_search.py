@@ -72,6 +72,7 @@ def test_two_strong_effects_are_found_by_every_kind_of_search(discrepancy_force)
     assert result.reduced_chi(result.after) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_no_more_effects_are_added_than_asked_and_the_rest_is_called_unexplained():
     result = refined(LinearModel({**DRAG, **GRAVITY}), {"max_effects": 1})
     assert [t.name for t in result.accepted] == ["gravity_scale"]
@@ -111,6 +112,7 @@ class Grids(LinearModel):
         return [one, 1.5 * one + size * 1e-3 * pattern(0, np.sin(20 * TIMES), POINTS[:, 1])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("named", [[], ["linear_drag", "body_force", "gravity_scale"]])
 def test_effects_that_exclude_each_other_are_never_in_one_model(named):
     """Two contact effects, for instance: in the second round the configuration names one that cannot be added."""
@@ -152,7 +154,7 @@ def test_the_shapes_of_a_cause_are_looked_for_if_it_is_named():
     assert again.considered(model, here) == [SPHERE]
 
 
-@pytest.mark.parametrize("shape", [SPHERE, HALF])
+@pytest.mark.parametrize("shape", only_first_quick([HALF, SPHERE]))
 def test_of_the_shapes_of_a_cause_the_one_that_is_there_is_named_once(shape):
     model = LinearModel({f"{shape}.strength": 0.1, **DRAG}, effects=SHAPES)
     result = refined(model, {"effects": [SPHERE, "linear_drag"]})
@@ -163,6 +165,7 @@ def test_of_the_shapes_of_a_cause_the_one_that_is_there_is_named_once(shape):
     assert {c.effect for c in first.candidates} == set(SHAPES)
 
 
+@pytest.mark.slow
 def test_the_shapes_of_a_cause_share_its_prior():
     """Two shapes that move the body alike are, together, as probable as one cause."""
     same = {SPHERE: SHAPES[HALF], HALF: SHAPES[HALF]}
@@ -172,6 +175,7 @@ def test_the_shapes_of_a_cause_share_its_prior():
     assert null[1] == pytest.approx(null[0], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_what_diverges_is_listed_with_its_reason():
     result = refined(LinearModel({**DRAG}, diverges=("viscosity",)))
     written = document(result)
@@ -220,6 +224,7 @@ class NoDerivatives(LinearModel):
         return super().fields(model, values, held_out=held_out)
 
 
+@pytest.mark.slow
 def test_a_model_without_derivatives_is_listed_with_its_reason_and_not_accepted():
     result = refined(NoDerivatives({"body_force.strength": 0.3, "velocity_z": 0.3}), {"effects": ["body_force"]})
     assert result.accepted == ()
@@ -246,6 +251,7 @@ def noisy(truth, noise, seed):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", only_first_quick(range(3)))
 def test_what_explains_a_small_part_of_large_errors_is_named_if_it_is_evident(seed):
     """The errors of points average out over the body, its motion does not."""
@@ -313,6 +319,7 @@ def test_ranking_alone_fits_and_changes_nothing():
     assert len(done.candidates) == len(EFFECTS)
 
 
+@pytest.mark.slow
 def test_effects_that_are_known_are_not_called_added():
     model = LinearModel({**DRAG, **GRAVITY})
     result = refined(model, known=["linear_drag"])
@@ -343,6 +350,7 @@ def test_a_worse_law_is_not_fitted_with_what_would_not_make_up_for_it():
     assert not could_improve(worst, base, trials)
 
 
+@pytest.mark.slow
 def test_a_baseline_that_cannot_be_simulated_does_not_end_the_search():
     model = LinearModel({**DRAG})
     good = baseline(model)

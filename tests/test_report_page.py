@@ -214,6 +214,7 @@ def test_it_draws_without_an_error_or_a_request(browser, report):
         assert picture_of(seen.page, "#pictures").std() > 5
 
 
+@pytest.mark.slow
 def test_the_slider_moves_every_view(browser, report):
     with watched(browser) as seen:
         opened(seen.page, report)

@@ -90,6 +90,7 @@ def test_each_recording_has_the_same_weight(seen, dropped, monkeypatch):
     assert once.law.wave_modulus() != pytest.approx(stiffer(2.0).wave_modulus(), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_stage_that_is_killed_goes_on_with_all_recordings(seen, dropped, tmp_path):
     class Stop(Exception):
         pass

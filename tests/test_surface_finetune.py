@@ -48,6 +48,7 @@ def test_surfaces_correct_what_paths_had_wrong(filmed, seen):
     assert objective.config.geometry_loss == "trajectory"  # the objective of the paths is not changed
 
 
+@pytest.mark.slow
 def test_a_finetune_that_is_farther_from_the_pictures_is_not_kept(filmed, seen):
     """Observed surfaces that drift backwards by 5 cm a frame draw the velocity away from the truth."""
     weights = {"finetune_silhouette_weight": 1e-3, "finetune_color_weight": 0.0}
@@ -91,6 +92,7 @@ def test_there_is_a_surface_finetune_only_with_pictures_to_compare(filmed, seen)
     assert {view for _, view in pictures} == {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", only_first_quick([("identify: fit surfaces", 1), ("identify: fit", 3)]))
 def test_a_fit_that_is_killed_among_paths_or_surfaces_ends_with_the_same_numbers(filmed, seen, tmp_path, stop):
     class Stop(Exception):

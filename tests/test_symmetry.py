@@ -122,6 +122,7 @@ def test_a_body_without_symmetry_stays_as_it_is():
             first_mirror(scene, TrajectoryConfig(fill_resolution=40, symmetry=tuple(axis)))
 
 
+@pytest.mark.slow
 def test_doubtful_masks_contradict_less():
     """Where masks are wrong by their own account as often as a plane needs it, they do not speak against it."""
     lost = {}

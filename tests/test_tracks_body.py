@@ -117,6 +117,7 @@ def test_mass_and_place_in_the_simulator():
     np.testing.assert_allclose(body.markers_to_world(body.particles[None])[0], [[0, 0, 0.1]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_clamp_holds_against_effects_and_has_no_part_in_gradients(taichi):
     """Within the clamp nothing moves at all, whatever acts there; the gradient of a drag beside it is right."""
     scene = bar()

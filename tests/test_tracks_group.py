@@ -55,6 +55,7 @@ def test_one_coefficient_where_all_share_it(tmp_path):
     assert after.validation_mm < 15
 
 
+@pytest.mark.slow
 def test_own_coefficients_and_a_body_that_lacks_nothing(tmp_path):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "middle": Ball(0.06, 0.065, 0.4), "light": Ball(0.03, 0.08, 0.7)}
     refined = found(write_scene(tmp_path, balls))

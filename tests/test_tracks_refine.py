@@ -18,6 +18,7 @@ from small import SMALL
 
 from masiv.cli import main
 from masiv.effects.catalogue import effect_named
+from masiv.effects.places import spacing_of
 from masiv.errors import InputError
 from masiv.identification.from_tracks import described_twin
 from masiv.identification.tracks import clamped_body_model, fit_law
@@ -294,9 +295,11 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
 def test_what_acts_on_the_matter_at_a_place_is_in_the_body(bar):
     simulation = clamped_body_model(bar, "", TRACKS, SIMULATOR, known={})
     particles = simulation.body(simulation.observations[0]).particles.numpy()
+    face = 0.5 * spacing_of(simulation.body(simulation.observations[0]).particles)
+    assert 0.001 < face < 0.01
     for name in ("point_mass", "point_force"):
         for p, low, high in zip(simulation.term(name).others, particles.min(0), particles.max(0), strict=True):
-            assert (p.lower, p.upper) == pytest.approx((low, high))
+            assert (p.lower, p.upper) == pytest.approx((low - face, high + face))
     beside = simulation.term("hidden_obstacle").parameters[-1]
     assert beside.upper > particles.max(0)[2] + 0.01
 
@@ -313,6 +316,7 @@ def masiv(monkeypatch, capfd):
     return run
 
 
+@pytest.mark.slow
 def test_commands_on_a_group(tmp_path, masiv):
     balls = {"heavy": Ball(7.0, 0.2, 0.0), "middle": Ball(0.06, 0.065, 0.4), "light": Ball(0.03, 0.08, 0.7)}
     scene, run = tmp_path / "scene", tmp_path / "run"

@@ -61,6 +61,7 @@ def lattice(count: int = 6, spacing: float = 0.1) -> np.ndarray:
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
 
 
+@pytest.mark.slow
 def test_a_missed_motion_is_found(scene, dynamic, monkeypatch):
     # The still motion contradicts the masks; what is tested here is the fine-tuning.
     monkeypatch.setattr("masiv.continuum.trajectory.images_against", lambda s, n, p, *_: np.zeros(len(p), int))
@@ -104,6 +105,7 @@ def test_interrupted_and_resumed_is_uninterrupted(scene, dynamic, tmp_path):
     assert not np.array_equal(other.positions, whole.positions)
 
 
+@pytest.mark.slow
 def test_saved_trajectory_evaluates_alone(scene, dynamic, tmp_path):
     result = estimate_trajectory(scene, dynamic, CONFIG.model_copy(update={"carve_images": 99, "iterations": 10}))
     result = replace(result, mirror=MirrorPlane(np.array([0.0, 0.6, 0.8]), 0.1))

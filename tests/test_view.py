@@ -327,6 +327,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(run):
         urllib.request.urlopen(found[0], timeout=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ring_scene import ring, spheres_scene
+from small import only_first_quick
 
 from masiv.hull.carve import visual_hull
 from masiv.hull.consistent_masks import consistent_masks
@@ -86,7 +87,7 @@ def test_mask_quality_names_the_bad_view():
     assert bad.problems()[0].startswith("view 2:")
 
 
-@pytest.mark.parametrize("count", [4, 8])
+@pytest.mark.parametrize("count", only_first_quick([4, 8]))
 def test_the_volume_is_within_its_uncertainty(count):
     """The hull of a ball in few cameras is larger than the ball; the prior allows for that."""
     scene = spheres_scene(lambda frame: [(CENTRE, RADIUS)], cameras=ring(count), frame_count=2)
@@ -111,6 +112,7 @@ def test_the_hull_of_a_drawn_shape_is_that_of_its_exact_masks():
     assert drawn == pytest.approx(exact, rel=0.03)
 
 
+@pytest.mark.slow
 def test_more_cameras_leave_less_phantom_volume():
     few, many = (hull_ratios(spheres_scene(body_with_arm, cameras=ring(n)), CENTRE, 0.3, 0.01).mean() for n in (3, 8))
     assert few > many > 1.0

@@ -230,11 +230,13 @@ def test_an_error_does_not_wait_for_running_tasks(tmp_path):
     assert not list(tmp_path.glob("finished *"))
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_told_of():
     with Workers(2, "identify.processes") as workers, pytest.raises(MasivError, match=r"set identify\.processes to 1"):
         list(workers.map(dies, [(), ()]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_task_beside_this_process(processes):
     with Workers(processes) as workers:
