@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,9 +88,9 @@ def _save(
     }
     observation = result.observations[0]
     assert isinstance(observation, VideoObservation)
-    for name, positions in rollouts.items():
-        errors = _picture_errors(scene, dynamic, positions, recording.whole, observation, progress)
-        for split, numbers in errors.items():
+    errors = _picture_errors(scene, dynamic, rollouts, recording.whole, observation, progress)
+    for name, by_split in errors.items():
+        for split, numbers in by_split.items():
             document[name][split] |= numbers
     if request.dry_run:
         write_json(folder.path / "refine.dry_run.json", document)
@@ -153,24 +153,29 @@ def _report(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, progress: P
 
 
 def _picture_errors(
-    scene: Scene, dynamic: DynamicGaussians, positions: np.ndarray, motion: Observed, observation: VideoObservation,
-    progress: Progress,
-) -> dict[str, dict[str, Any]]:  # fmt: skip
-    """Chamfer to the ``motion`` that was followed, and pictures against the video, over the frames of each part of
-    ``observation``."""
+    scene: Scene, dynamic: DynamicGaussians, rollouts: Mapping[str, np.ndarray], motion: Observed,
+    observation: VideoObservation, progress: Progress,
+) -> dict[str, dict[str, dict[str, Any]]]:  # fmt: skip
+    """By the names of ``rollouts`` (T, Q, 3): Chamfer to the ``motion`` that was followed, and pictures against the
+    video, over the frames of each part of ``observation``."""
     from masiv import metrics
     from masiv.report.follow import Binding
-    from masiv.report.pictures import score_pictures
+    from masiv.report.pictures import GaussiansAt, score_pictures
 
-    binding = Binding.at_rest(dynamic.at(0.0), positions[0])
+    def moved(positions: np.ndarray) -> GaussiansAt:
+        binding = Binding.at_rest(dynamic.at(0.0), positions[0])
+        return lambda frame: binding.moved(positions[frame])
+
+    models = {name: moved(positions) for name, positions in rollouts.items()}
     views = list(range(len(scene.cameras)))
-    out: dict[str, dict[str, Any]] = {}
+    out: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in rollouts}
     samples = observation.samples_per_frame
     for split, part in observation.parts.items():
         frames = list(range(1 + part.start // samples, 1 + part.stop // samples))
-        scores = score_pictures(scene, {"twin": lambda f: binding.moved(positions[f])}, frames, progress=progress)
-        numbers = scores["twin"].mean(views, frames) or {}
-        kept = {k: numbers[k] for k in ("psnr_db", "psnr_box_in_scene_db", "ssim", "mask_iou") if k in numbers}
-        chamfer = [metrics.chamfer_1e3mm2(positions[f], motion.positions[f]) for f in frames]
-        out[split] = {"frames": frames, "chamfer_1e3mm2": float(np.mean(chamfer)), **kept}
+        scores = score_pictures(scene, models, frames, progress=progress)
+        for name, positions in rollouts.items():
+            numbers = scores[name].mean(views, frames) or {}
+            kept = {k: numbers[k] for k in ("psnr_db", "psnr_box_in_scene_db", "ssim", "mask_iou") if k in numbers}
+            chamfer = [metrics.chamfer_1e3mm2(positions[f], motion.positions[f]) for f in frames]
+            out[name][split] = {"frames": frames, "chamfer_1e3mm2": float(np.mean(chamfer)), **kept}
     return out
