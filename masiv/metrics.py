@@ -70,7 +70,7 @@ def tracked_error_mm(
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
     """Peak signal-to-noise ratio [dB] over all pixels and channels; infinite for equal pictures."""
-    box = _content_box(image, reference, 0)
+    box = content_box(image, reference)
     if box is None:
         return float("inf")
     error = float(((_unit(image[box]) - _unit(reference[box])) ** 2).sum()) / image.size
@@ -79,7 +79,7 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     """Structural similarity (Wang et al. 2004): 11×11 Gaussian window, σ = 1.5, zero padding, mean over channels."""
-    box = _content_box(image, reference, SSIM_RADIUS)
+    box = content_box(image, reference, margin=SSIM_RADIUS)
     if box is None:
         return 1.0
     a, b = _unit(image[box]), _unit(reference[box])
@@ -92,10 +92,11 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     return float((score - 1).sum()) / image.size + 1  # it is 1 where the windows of both are black
 
 
-def _content_box(image: np.ndarray, reference: np.ndarray, margin: int) -> tuple[slice, slice] | None:
-    """Rows and columns with all pixels that are not black in both, and ``margin`` more; None if there is none."""
-    lit = np.zeros(image.shape[:2], bool)
-    for picture in (image, reference):
+def content_box(*pictures: np.ndarray, margin: int = 0) -> tuple[slice, slice] | None:
+    """Rows and columns with all pixels that are not black in each of ``pictures`` (H, W, C), and ``margin`` more; None
+    if there is none."""
+    lit = np.zeros(pictures[0].shape[:2], bool)
+    for picture in pictures:
         for channel in range(picture.shape[2]):  # ``any`` over the last axis takes five times as long
             lit |= picture[:, :, channel] != 0
     return _box(lit, margin)

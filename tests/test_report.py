@@ -7,10 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from masiv.errors import InputError
 from masiv.report import history, measure, pictures
+from masiv.report.camera_view import Cut
 from masiv.report.draw import backdrop, draw
 from masiv.report.follow import Binding
 from masiv.report.media import write_png, write_video
@@ -167,6 +170,18 @@ def test_of_a_large_recording_as_many_pictures_are_measured_as_a_mean_needs(taic
     assert scores["one"].mean([], [4]) is None
 
 
+@settings(max_examples=50, deadline=None)
+@given(numbers=st.lists(st.integers(0, 12), min_size=8, max_size=8))
+def test_of_a_picture_with_a_small_object_only_that_is_kept(numbers):
+    pairs = [slice(*sorted(numbers[k : k + 2])) for k in range(0, 8, 2)]
+    lit, box = pairs[:2], pairs[2:]
+    picture = np.zeros((12, 12, 3), np.uint8)
+    picture[lit[0], lit[1]] = np.arange(1, 145, dtype=np.uint8).reshape(12, 12, 1)[lit[0], lit[1]]
+    cut = Cut.of(picture)
+    np.testing.assert_array_equal(cut.within((box[0], box[1])), picture[box[0], box[1]])
+    assert cut.content.size == picture[lit[0], lit[1]].size
+
+
 def test_truth_and_motion_numbers(tmp_path):
     points = np.random.default_rng(0).random((400, 3))
     truth = points + np.arange(3)[:, None, None] * np.array([0.1, 0, 0])
@@ -217,9 +232,11 @@ def test_table_has_a_row_a_block():
             "held_out_views": None,
         },
         "fit": {"frames": [1, 2], "trajectory_rmse_mm": 3.0},
+        "twin": {"frames": list(range(0, 120, 6)), "views": [0, 1], "psnr_db": 10.0},
     }
     header, body = rows(numbers)
     assert header == ["what", "frames", "views", "PSNR [dB]", "to trajectory [mm]"]
     assert body[0] == ["reconstruction, training views", "0–2, 5", "0", 20.0, None]
     assert body[1][0] == "fit"
+    assert body[2][:3] == ["twin", "20 of 0–114", "0–1"]
     assert "20" in table(numbers)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from masiv.errors import MasivError
-from masiv.metrics import mask_box
+from masiv.metrics import content_box, mask_box
 from masiv.report.draw import draw, on_black
 from masiv.report.follow import Binding
 from masiv.report.motion_view import shown_instants
@@ -20,6 +21,8 @@ from masiv.scene.scene import Scene
 if TYPE_CHECKING:
     from masiv.splat.dynamic import DynamicGaussians
 
+Box = tuple[slice, slice]
+"""Rows and columns of a picture."""
 VIEWS = 4
 MAX_BYTES = 900_000
 """Of all cameras together, before base64."""
@@ -44,41 +47,71 @@ def camera_data(run: RunFolder, scene: Scene, dynamic: DynamicGaussians, rollout
     found = []
     for view in views:
         role = "kept out of the fit" if view in run.holdout_cameras else "seen by the fit"
-        series = _series(run, scene, dynamic, binding, rollout, view, frames)
-        height, width = series["observed"][0].shape[:2]
-        encoded_series = _encoded(series, MAX_BYTES // len(views))
+        series, box = _series(run, scene, dynamic, binding, rollout, view, frames)
+        height, width = (part.stop - part.start for part in box)
+        encoded_series = _encoded(series, box, MAX_BYTES // len(views))
         name = f"Camera {view} ({scene.cameras[view].name}), {role}"
         found.append({"name": name, "width": width, "height": height, **encoded_series})
     return found
 
 
+@dataclass(frozen=True)
+class Cut:
+    """A picture that is black but for ``content`` (H, W, 3) uint8, with the first row and column of that: of large
+    pictures of a small object many can be held."""
+
+    content: np.ndarray
+    row: int
+    column: int
+
+    @classmethod
+    def of(cls, picture: np.ndarray) -> Cut:
+        rows, columns = content_box(picture) or (slice(0, 0), slice(0, 0))
+        return cls(picture[rows, columns].copy(), rows.start, columns.start)
+
+    def within(self, box: Box) -> np.ndarray:
+        """The part ``box`` of the whole picture."""
+        rows, columns = box
+        out = np.zeros((rows.stop - rows.start, columns.stop - columns.start, 3), np.uint8)
+        height, width = self.content.shape[:2]
+        top, left = max(self.row, rows.start), max(self.column, columns.start)
+        bottom, right = min(self.row + height, rows.stop), min(self.column + width, columns.stop)
+        if bottom > top and right > left:
+            own = self.content[top - self.row : bottom - self.row, left - self.column : right - self.column]
+            out[top - rows.start : bottom - rows.start, left - columns.start : right - columns.start] = own
+        return out
+
+
 def _series(
     run: RunFolder, scene: Scene, dynamic: DynamicGaussians, binding: Binding, rollout: np.ndarray, view: int,
     frames: Sequence[int],
-) -> dict[str, list[Any]]:  # fmt: skip
-    """Pictures (H, W, 3) uint8 of the object on black, cut to where it ever is."""
+) -> tuple[dict[str, list[Cut | None]], Box]:  # fmt: skip
+    """Pictures of the object on black, and the part where it ever is."""
     camera = scene.cameras[view]
-    series: dict[str, list[Any]] = {"observed": [], "reconstruction": [], "twin": []}
+    series: dict[str, list[Cut | None]] = {"observed": [], "reconstruction": [], "twin": []}
     ever = np.zeros((camera.height, camera.width), np.float32)
     for frame in frames:
         observed = scene.frame(view, frame)
         simulated, alpha = draw(binding.moved(rollout[frame]), camera)
         ever = np.maximum(ever, np.maximum(observed.mask, alpha))
-        series["observed"].append(on_black(observed.image, observed.mask))
+        series["observed"].append(Cut.of(on_black(observed.image, observed.mask)))
         fitted = frame < run.fit_frames
-        series["reconstruction"].append(draw(dynamic.at(frame / scene.fps), camera)[0] if fitted else None)
-        series["twin"].append(simulated)
-    box = mask_box(ever, margin=6) or (slice(None), slice(None))
-    return {name: [None if p is None else p[box] for p in pictures] for name, pictures in series.items()}
+        series["reconstruction"].append(Cut.of(draw(dynamic.at(frame / scene.fps), camera)[0]) if fitted else None)
+        series["twin"].append(Cut.of(simulated))
+    rows, columns = mask_box(ever, margin=6) or (slice(0, camera.height), slice(0, camera.width))
+    return series, (
+        slice(rows.start, min(rows.stop, camera.height)),
+        slice(columns.start, min(columns.stop, camera.width)),
+    )
 
 
-def _encoded(series: dict[str, list[Any]], budget: int) -> dict[str, list[str | None]]:
-    """WebP as data of a page, small enough for ``budget`` [bytes] if a setting allows."""
+def _encoded(series: dict[str, list[Cut | None]], box: Box, budget: int) -> dict[str, list[str | None]]:
+    """WebP of the part ``box`` as data of a page, small enough for ``budget`` [bytes] if a setting allows."""
     files: dict[str, list[bytes | None]] = {}
     for height, quality in SETTINGS:
         files = {
-            name: [None if p is None else _webp(p, height, quality) for p in pictures]
-            for name, pictures in series.items()
+            name: [None if cut is None else _webp(cut.within(box), height, quality) for cut in cuts]
+            for name, cuts in series.items()
         }
         if sum(len(file) for pictures in files.values() for file in pictures if file) <= budget:
             break

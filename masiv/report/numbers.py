@@ -170,6 +170,8 @@ def evaluation_numbers(
     }
 
 
+MAX_SPANS = 4
+"""Parts of a list of frames or views in a table."""
 COLUMNS = {
     "psnr_box_in_scene_db": "PSNR box, in scene [dB]",
     "psnr_box_db": "PSNR box, on black [dB]",
@@ -221,7 +223,7 @@ def table(numbers: Mapping[str, Any]) -> str:
 
 
 def _span(indices: list[int] | None) -> str | None:
-    """[0, 1, 2, 5] -> '0–2, 5'."""
+    """[0, 1, 2, 5] -> '0–2, 5'; if that would be more than ``MAX_SPANS`` parts, '21 of 0–119'."""
     if not indices:
         return None
     runs: list[list[int]] = []
@@ -230,6 +232,8 @@ def _span(indices: list[int] | None) -> str | None:
             runs[-1].append(index)
         else:
             runs.append([index])
+    if len(runs) > MAX_SPANS:
+        return f"{len(indices)} of {indices[0]}–{indices[-1]}"
     return ", ".join(str(run[0]) if len(run) == 1 else f"{run[0]}–{run[-1]}" for run in runs)
 
 

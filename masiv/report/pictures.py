@@ -64,7 +64,8 @@ def score_pictures(
             observed = scene.frame(view, frame)
             for name, own in gaussians.items():
                 out[name][view, frame] = _scores(scene, view, observed, own)
-    progress("measure pictures", len(frames), len(frames))
+    if frames:
+        progress("measure pictures", len(frames), len(frames))
     return {name: PictureScores(own) for name, own in out.items()}
 
 
