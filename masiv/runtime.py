@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator
 from typing import Any
 
+from masiv.cores import available_cores
 from masiv.errors import InputError
 
 _started: str | None = None
@@ -29,6 +30,7 @@ def silence() -> None:
 def start(arch: str = "cpu") -> Any:
     """Start Taichi on ``arch`` (cpu, cuda or vulkan), once a process, and return the ``taichi`` module.
 
+    On a CPU it takes no more threads than ``available_cores``, unless ``TI_CPU_MAX_NUM_THREADS`` says otherwise.
     A second call with the same arch does nothing, since ``ti.init`` would destroy every field.
     Raises InputError for an unknown arch, for one that this machine lacks, and for a change of arch.
     """
@@ -43,11 +45,17 @@ def start(arch: str = "cpu") -> Any:
     known = {"cpu": ti.cpu, "cuda": ti.cuda, "vulkan": ti.vulkan}
     if arch not in known:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
+    cores = available_cores()
+    limit = {} if "TI_CPU_MAX_NUM_THREADS" in os.environ else {"cpu_max_num_threads": cores}
+    if cores < (os.cpu_count() or 1):  # neither library knows of a container's limit
+        import torch
+
+        torch.set_num_threads(min(torch.get_num_threads(), cores))
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, and stdout may be for one JSON object
         # One of Taichi's own passes is half of a kernel's compilation, and LLVM does its work again; see ``adjoint``.
         # It would warn of loops over more than 32 coefficients of an effect, which compile in seconds.
         ti.init(arch=known[arch], log_level=ti.ERROR, offline_cache=True, random_seed=0, cfg_optimization=False,
-                unrolling_limit=0)  # fmt: skip
+                unrolling_limit=0, **limit)  # fmt: skip
     atexit.register(ti.reset)  # writes the kernel cache, which the next command starts from
     running = _taichi_config().arch
     if arch != "cpu" and running != known[arch]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from urllib.parse import quote
 
@@ -11,6 +10,7 @@ from masiv.batch.plan import stages_of
 from masiv.batch.run import RECORD, run_stages
 from masiv.batch.spec import jobs_of, overridden, read_spec
 from masiv.batch.table import PAGE, TABLE, as_text, rows_of, write_page, write_table
+from masiv.cores import available_cores
 from masiv.errors import InputError
 from masiv.folder_lock import locked
 from masiv.pipeline.requests import Overrides, Summary
@@ -46,7 +46,7 @@ def run_batch(
     if dry_run:
         lines = [" ".join(("masiv", *stage.command)) for stage in stages]
         return Summary({"out": str(folder), "commands": [list(stage.command) for stage in stages]}, "\n".join(lines))
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     count = workers or min(cores, len(jobs))
     if (
         folder.exists()

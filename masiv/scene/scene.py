@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from masiv.cores import available_cores
 from masiv.errors import InputError
 from masiv.memory import return_freed
 from masiv.scene.camera import Camera
@@ -157,7 +157,7 @@ class Scene:
         return self._map(lambda view: function(view, *self.mask(view, frame)))
 
     def _map(self, function: Callable[[int], T]) -> list[T]:
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
+        with ThreadPoolExecutor(available_cores()) as threads:
             return list(threads.map(function, self.views))
 
     @cached_property
