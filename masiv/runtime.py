@@ -46,7 +46,7 @@ def start(arch: str = "cpu") -> Any:
     if arch not in known:
         raise InputError(f"unknown arch '{arch}': use one of {', '.join(known)}")
     cores = available_cores()
-    limit = {} if "TI_CPU_MAX_NUM_THREADS" in os.environ else {"cpu_max_num_threads": cores}
+    limit: dict[str, Any] = {} if "TI_CPU_MAX_NUM_THREADS" in os.environ else {"cpu_max_num_threads": cores}
     if cores < (os.cpu_count() or 1):  # neither library knows of a container's limit
         import torch
 
