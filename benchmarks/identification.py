@@ -41,7 +41,7 @@ from masiv.observations.read import read_scene
 from masiv.pipeline import Overrides, SceneRequest, open_run, stages
 from masiv.pipeline.video import VideoRun
 from masiv.report.measure import motion_numbers, read_truth
-from masiv.report.numbers import twin_numbers
+from masiv.report.numbers import both_numbers
 from masiv.runfolder import RunFolder
 from masiv.scene.scene import Scene
 from masiv.simulation.simulate import simulate
@@ -165,7 +165,7 @@ def measured(
     law = twin.law.description()
     expected = true_parameters(truth) if law["kind"] == FAMILY[truth["type"]] else {}
     splits = {"observed": range(run.fit_frames), "future": range(run.fit_frames, scene.frame_count)}
-    seen = twin_numbers(run, scene, stages.load_gaussians(run), rollout)
+    seen = both_numbers(run, scene, stages.load_gaussians(run), rollout)["twin"]
     numbers = {}
     for split, frames in splits.items():
         pictures = seen[split] or {}
