@@ -19,7 +19,7 @@ def available_cores(control_groups: Path = CONTROL_GROUPS) -> int:
     """
     affinity = getattr(os, "sched_getaffinity", None)  # Linux
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-    share = math.inf
+    share = float(cores)
     with suppress(OSError, ValueError):  # no such file, or "max": no limit
         quota, period = (control_groups / "cpu.max").read_text().split()
         share = int(quota) / int(period)
@@ -27,4 +27,4 @@ def available_cores(control_groups: Path = CONTROL_GROUPS) -> int:
         quota = int((control_groups / "cpu/cpu.cfs_quota_us").read_text())
         if quota > 0:  # -1: no limit
             share = min(share, quota / int((control_groups / "cpu/cpu.cfs_period_us").read_text()))
-    return max(1, min(cores, math.ceil(share) if math.isfinite(share) else cores))
+    return max(1, min(cores, math.ceil(share)))

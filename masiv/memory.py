@@ -10,12 +10,12 @@ from pathlib import Path
 
 import psutil
 
+from masiv.cores import CONTROL_GROUPS
+
 INTERVAL_S = 0.5
 """Between two samples of the memory that a stage takes."""
 MAX_SHARE = 0.02
 """Of the time of a core that samples may take, at most."""
-CONTROL_GROUPS = Path("/sys/fs/cgroup")
-"""Where Linux mounts the limits of containers."""
 GROWTH = 1.01
 """Resident memory that is this many times larger than any before is a new peak."""
 

@@ -18,7 +18,6 @@ from small import SMALL
 
 from masiv.cli import main
 from masiv.effects.catalogue import effect_named
-from masiv.effects.places import spacing_of
 from masiv.errors import InputError
 from masiv.identification.from_tracks import described_twin
 from masiv.identification.tracks import clamped_body_model, fit_law
@@ -294,8 +293,8 @@ def test_load_is_found_where_the_release_is_not_seen(bar):
 
 def test_what_acts_on_the_matter_at_a_place_is_in_the_body(bar):
     simulation = clamped_body_model(bar, "", TRACKS, SIMULATOR, known={})
-    particles = simulation.body(simulation.observations[0]).particles.numpy()
-    face = 0.5 * spacing_of(simulation.body(simulation.observations[0]).particles)
+    body = simulation.body(simulation.observations[0])
+    particles, face = body.particles.numpy(), 0.5 * (body.volume / len(body.particles)) ** (1 / 3)
     assert 0.001 < face < 0.01
     for name in ("point_mass", "point_force"):
         for p, low, high in zip(simulation.term(name).others, particles.min(0), particles.max(0), strict=True):

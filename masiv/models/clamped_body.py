@@ -21,7 +21,6 @@ from masiv.effects.catalogue import causes, effect_named
 from masiv.effects.context import EffectContext, EffectParameter
 from masiv.effects.effect import ClockEffect, ContactEffect, Effect, GeometryEffect
 from masiv.effects.per_body import DragBody
-from masiv.effects.places import spacing_of
 from masiv.errors import MasivError
 from masiv.materials.classical import UNITS, ClassicalLaw
 from masiv.models.base import EffectTerm, FittedModel, ForwardModel, Model
@@ -189,8 +188,9 @@ class ClampedBodyModel(ForwardModel):
         return EffectTerm(name, name, tuple(own[:cut]), tuple(own[cut:]), guesses, units)
 
     def _parameter(self, effect: Effect, p: EffectParameter) -> Parameter:
-        particles = self.body(self.observations[0]).particles
-        low, high = particles.numpy().min(0), particles.numpy().max(0)
+        body = self.body(self.observations[0])
+        particles = body.particles.numpy()
+        low, high = particles.min(0), particles.max(0)
         size = float((high - low).max())
         mass = self.drag_body.mass
         lower, upper, step = p.lower, p.upper, p.step
@@ -200,11 +200,10 @@ class ClampedBodyModel(ForwardModel):
             step = FORCE_STEP * mass * float(np.linalg.norm(self.tracks.gravity))
         elif p.unit == "m":
             step = LENGTH_STEP * size
-            if (
-                p.name in "xyz"
-            ):  # in the matter, whose face is half a spacing outside of the outermost particles, or near
-                k, inside = "xyz".index(p.name), effect.hints.inside
-                reach = 0.5 * spacing_of(particles) if inside else PLACE_MARGIN * size
+            if p.name in "xyz":
+                # The face of the matter is half a spacing outside of the outermost particles.
+                face = 0.5 * (body.volume / body.count) ** (1 / 3)
+                k, reach = "xyz".index(p.name), face if effect.hints.inside else PLACE_MARGIN * size
                 lower, upper = float(low[k]) - reach, float(high[k]) + reach
         return Parameter(f"{effect.name}.{p.name}", float(np.clip(p.start, lower, upper)), lower, upper, step)
 
