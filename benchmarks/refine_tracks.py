@@ -45,6 +45,13 @@ STRENGTHS = {
     "time_offset": [{"delay": 0.02}, {"delay": -0.015}],
 }  # fmt: skip
 
+PAIRS = (
+    ("quadratic_drag", "restitution"), ("body_force", "viscosity"), ("linear_drag", "swirl"),
+    ("quadratic_drag", "point_mass"), ("ground_friction", "restitution"), ("body_force", "ground_friction"),
+    ("linear_drag", "periodic_force"), ("body_force", "stiffness_contrast"), ("ground_friction", "viscosity"),
+    ("body_force", "restitution"),
+)  # fmt: skip
+"""Strong effects that act at once on the elastic body, in addition to two pairs of other strengths."""
 OTHER = {"viscosity": "stiff", "restitution": "stiff"}
 """The second material of an effect, if that is not the plastic one: what damps or bounces hardly shows there."""
 OUTSIDE = {
@@ -56,7 +63,8 @@ OUTSIDE = {
 
 def cases():
     """Controls of every material; every effect, strong on an elastic body and weak on another; two at once; unknown;
-    the other way round, weak on an elastic body and strong on another; and a pull that is nothing like uniform."""
+    the other way round, weak on an elastic body and strong on another; a pull that is nothing like uniform; more pairs.
+    """
     from track_cases import Case
 
     out = []
@@ -84,6 +92,9 @@ def cases():
     law, parameters = ELASTIC
     near = {"attraction": {"strength": 0.5, "x": 0.45, "y": 0.5, "z": 0.35}}
     out.append(Case("unknown_attraction_near", law, parameters, {}, seed=len(out), outside=near))
+    for names in PAIRS:
+        two = {name: STRENGTHS[name][-1] for name in names}
+        out.append(Case("+".join(names), law, parameters, two, seed=len(out)))
     return sorted(out, key=lambda case: case.law != "neo_hookean" or case.name.endswith("_stiff"))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
@@ -86,13 +88,27 @@ def test_marginal_likelihood_is_that_of_a_dense_normal_density():
 def test_a_strength_that_cannot_be_negative_has_the_mass_above_zero():
     rng = np.random.default_rng(2)
     b = block(rng, count=1)
-    free, half = (ParameterPriors(np.array([0.3]), np.array([[0.5]]), p) for p in (None, 0))
+    free, half = (ParameterPriors(np.array([0.3]), np.array([[0.5]]), p) for p in ((), (0,)))
     whole, part = (_Likelihood([b], p, SizePriors.of([b])).terms(np.zeros(4)) for p in (free, half))
     above = norm.sf(0.0, whole.mean[0, 0], whole.covariance[0, 0, 0] ** 0.5)
     assert part.logp[0] - whole.logp[0] == pytest.approx(np.log(2 * above))
 
 
-@pytest.mark.parametrize("positive", [None, 1])
+def test_of_several_strengths_that_cannot_be_negative_one_may_be_near_zero():
+    # The first is far above zero, the second below: their probability of being positive is that of the second one.
+    rng = np.random.default_rng(2)
+    slope = block(rng).jacobian
+    b = replace(block(rng), residual=-(slope[..., 1] * 3 - slope[..., 2] * 0.4), jacobian=slope)
+    free, half = (ParameterPriors(np.zeros(3), np.array([[0.1, 1e-4, 1e-3]]), p) for p in ((), (1, 2)))
+    whole, part = (_Likelihood([b], p, SizePriors.of([b])).terms(np.zeros(4)) for p in (free, half))
+    mean, covariance = whole.mean[0, 1:], whole.covariance[0, 1:, 1:]
+    assert mean[0] > 4 * covariance[0, 0] ** 0.5
+    assert -4 * covariance[1, 1] ** 0.5 < mean[1] < 0
+    both = multivariate_normal.cdf(mean, np.zeros(2), covariance)
+    assert part.logp[0] - whole.logp[0] == pytest.approx(np.log(4 * both), abs=0.02)
+
+
+@pytest.mark.parametrize("positive", [(), (1,), (1, 2)])
 def test_gradient_by_the_sizes_is_that_of_finite_differences(positive):
     rng = np.random.default_rng(3)
     blocks = [block(rng), block(rng, modes=4, sizes=(0.5, 1.0), weight=0.3)]

@@ -96,8 +96,7 @@ class Evidence:
                 for p in term.strengths:
                     row[names.index(p.name)] = strength_scales(p)[k] ** -2
             rows.append(row)
-        single = terms[0].strengths if len(terms) == 1 else ()
-        positive = names.index(single[0].name) if len(single) == 1 and single[0].lower >= 0 else None
+        positive = tuple(names.index(p.name) for t in terms for p in t.strengths if p.lower >= 0)
         return ParameterPriors(mean, np.array(rows), positive)
 
     def range_of(self, p: Parameter, unit: str | None) -> float:

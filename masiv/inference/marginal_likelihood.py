@@ -42,12 +42,13 @@ class ParameterPriors:
     """Of P parameters, in their fitted scales, about the values at which the residual was linearised.
 
     mean (P,): prior mean less fitted value. precision (S, P): of S components of a mixture of normal densities, equally
-    likely. positive: index of the one strength that cannot be negative, None if there is none or several.
+    likely. positive: indices of the strengths that cannot be negative. Their probability of being positive is taken for
+    the product of each one's: exact if all but one are far from zero, as those are that were named.
     """
 
     mean: np.ndarray
     precision: np.ndarray
-    positive: int | None = None
+    positive: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -165,8 +166,7 @@ class _Likelihood:
         direction = np.concatenate([np.ones((count, 1)), -solved], axis=1)
         slope = -0.5 * direction[:, :, None] * direction[:, None, :]
         slope[:, 1:, 1:] -= 0.5 * covariance
-        if self.priors.positive is not None:
-            k = self.priors.positive
+        for k in self.priors.positive:
             column = covariance[:, k]
             sd = np.sqrt(column[:, k])
             z = -solved[:, k] / sd  # the prior, of mean zero, has half of its mass above zero
