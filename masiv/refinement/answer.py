@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
 def answer(document: Mapping[str, Any]) -> str:
-    """The verdict with what was accepted, and, if the motion does not distinguish an effect from others, with these."""
+    """The verdict with what was accepted, and, if the motion does not distinguish an effect from others, with these.
+    If it cannot be told, what is probable: the 95 % credible set."""
     names = ", ".join(map(_with_others, document["accepted"]))
     if not names:
-        return document["verdict"]
+        sets = document["credible_set"] if document["verdict"] == "cannot tell" else []
+        told = [f"{together(s['effects'])} {s['probability']:.2g}" for s in sets]
+        return f"{document['verdict']}: {', '.join(told)}" if len(told) > 1 else document["verdict"]
     added = ", although an effect was added" if document["verdict"] == "unexplained residual" else ""
     return f"{document['verdict']}{added}: {names}"
+
+
+def together(terms: Sequence[str]) -> str:
+    """Terms that act at once, for people: effects, with whom each acts on if not on all."""
+    told = [(words(effect), scope) for effect, _, scope in (term.partition("@") for term in terms)]
+    return " and ".join(f"{name} ({scope})" if scope else name for name, scope in told) or "no effect"
+
+
+def grid_advice(document: Mapping[str, Any]) -> str | None:
+    """What to do if it cannot be told and what another grid would change is as large as the residual; else None."""
+    grid, residual = document["discretization_mm"]["fit"] or 0.0, document["residual_mm"]["fit"]
+    if document["verdict"] != "cannot tell" or grid < residual:
+        return None
+    return (
+        "what another grid of the simulation would change is as large as the residual: more particles may tell "
+        "(refine.particles; of tracks, tracks.particles)"
+    )
 
 
 def _with_others(entry: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from masiv.inference.model_fit import PARTS
-from masiv.refinement.answer import answer, outcome
+from masiv.refinement.answer import answer, grid_advice, outcome, together
 from masiv.refinement.result import RANKED
 from masiv.refinement.support import question
 
@@ -84,6 +84,8 @@ def text(document: Mapping[str, Any]) -> str:
             f"{_vector(n['initial_velocity'])} m/s with a spin of {_vector(n['initial_omega'])} rad/s would set them "
             f"{n['predicted_difference_mm']:.0f} mm apart"
         )
+    advice = grid_advice(shown)
+    lines += [advice] if advice else []
     lines += [f"problem: {problem}" for problem in shown.get("problems", ())]
     return "\n".join([*lines, answer(shown)])
 
@@ -110,7 +112,7 @@ def _refit_line(row: Mapping[str, Any]) -> str:
 
 def _credible_lines(sets: Sequence[Mapping[str, Any]]) -> list[str]:
     """What may act, where that is more than one answer."""
-    told = [f"{' and '.join(s['effects']) or 'no effect'} {s['probability']:.2g}" for s in sets]
+    told = [f"{together(s['effects'])} {s['probability']:.2g}" for s in sets]
     return [f"95 % credible set of the first round: {', '.join(told)}"] if len(told) > 1 else []
 
 

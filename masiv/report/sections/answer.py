@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from masiv.refinement.answer import words
+from masiv.refinement.answer import grid_advice, together, words
 from masiv.report.page import Card
 from masiv.report.quantities import millimetres, percent, quantity
 
@@ -195,13 +195,11 @@ def _how_sure(twin: Twin, material: Mapping[str, Any] | None, refined: Sequence[
             )
         elif document["verdict"] != "ranked only":
             lines += _probabilities(document)
+        advice = grid_advice(document)
+        lines += [f"{where}{_upper(advice)}."] if advice else []
     doubtful = any(document["verdict"] not in ("effect added", "nothing missing") for document in refined)
     answer = "; ".join(dict.fromkeys(_upper(document["verdict"]) for document in refined))
     return Card(question, answer, lines, open=doubtful)
-
-
-def _together(effects: Sequence[str]) -> str:
-    return " and ".join(words(name.partition("@")[0]) for name in effects) or "no effect"
 
 
 def _probabilities(document: Mapping[str, Any]) -> list[str]:
@@ -211,12 +209,12 @@ def _probabilities(document: Mapping[str, Any]) -> list[str]:
         lines.append(f"Probability of the model without any effect: {percent(document['null_probability'])}.")
         if first is not None:
             lines.append(
-                f"Most probable in the first round: {_together(first['effects'])}, {percent(first['probability'])}."
+                f"Most probable in the first round: {together(first['effects'])}, {percent(first['probability'])}."
             )
     else:
         lines.append(f"Probability that no effect of the library acts: {percent(document['null_probability'])}.")
         may_act = [s for s in document["credible_set"] if s["effects"]]
-        told = (f"{_together(s['effects'])} ({percent(s['probability'])})" for s in may_act)
+        told = (f"{together(s['effects'])} ({percent(s['probability'])})" for s in may_act)
         lines += [f"Not excluded: {', '.join(told)}."] if may_act else []
     lines.append(f"Probability that something unknown acts: {percent(document['unknown_probability'])}.")
     chance = document["predictive_p"]["after"]
