@@ -25,8 +25,9 @@ def document(**changes):
         "unknown_probability": 0.03, "test": {"after": {"rmse_mm": 15.0, "expected_rmse_mm": 17.5, "log_density": 3.0}},
         "credible_set": [{"effects": ["linear_drag"], "probability": 0.97}],
         "upper_limits": [{"effect": "restitution", "scope": "all", "strength": 0.0345, "unit": "1", "motion_mm": 2.25,
-                          "determined": True}], "noise_floor_mm": 2.5, "discretization_mm": {"fit": 3.0, "validation":
-        4.0}, "grid_change": {"before": 0.4, "after": 0.625},
+                          "determined": True}], "noise_floor_mm": 2.5,
+        "observation_error_mm": {"fit": 2.6, "validation": 2.7}, "discretization_mm": {"fit": 3.0, "validation": 4.0},
+        "grid_change": {"before": 0.4, "after": 0.625},
         "residual_mm": {"fit": 10.7, "validation": 40.2},
         "candidates": [
             {"effect": "linear_drag", "explained": 0.81, "theta": 0.7, "unit": "1/s", "stderr": 0.02,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from masiv.inference.model_fit import PARTS, ModelFit, part_mm
 from masiv.inference.predictive import Forecast
 from masiv.models.base import EffectTerm
 from masiv.models.free_body import GRID_CORRECTION
-from masiv.observations.base import rms_mm
+from masiv.observations.base import Observation, rms_mm
 from masiv.refinement.answer import answer
 from masiv.refinement.candidates import Candidate
 from masiv.refinement.discrepancy import DISCREPANCY_FORCE
@@ -37,7 +38,8 @@ def document(result: RefineResult) -> dict[str, Any]:
         "condition": result.condition,
         "verdict": result.verdict,
         "noise_floor_mm": 1e3 * float(np.mean([e.noise_std for e in result.observations])),
-        "discretization_mm": _discretization_mm(result),
+        "observation_error_mm": _expected_mm(result, _observation_variance),
+        "discretization_mm": _expected_mm(result, _discretization_variance),
         "grid_change": {"before": _grid_change(result, before), "after": _grid_change(result, after)},
         "reduced_chi": {"before": result.reduced_chi(before), "after": result.reduced_chi(after)},
         "residual_mm": {"fit": before.fit_mm, "validation": before.validation_mm},
@@ -78,14 +80,24 @@ def _short(term: EffectTerm, name: str) -> str:
     return name.removeprefix(f"{term.name}.")
 
 
-def _discretization_mm(result: RefineResult) -> dict[str, float | None]:
-    """By how much one grid more may differ, root mean square [mm] over the instants of each part."""
+def _expected_mm(result: RefineResult, variances: Callable[[Observation], np.ndarray]) -> dict[str, float | None]:
+    """Root mean square [mm] over the instants of each part, from ``variances`` (T,) [m²] of each observation."""
 
     def root(part: str) -> float | None:
-        own = [(e.residual_std**2 - e.noise_std**2)[e.parts[part]] for e in result.observations if part in e.parts]
+        own = [variances(e)[e.parts[part]] for e in result.observations if part in e.parts]
         return 1e3 * math.sqrt(max(float(np.concatenate(own).mean()), 0.0)) if own else None
 
     return {part: root(part) for part in PARTS}
+
+
+def _observation_variance(observation: Observation) -> np.ndarray:
+    """Expected errors of the observation: noise, and errors of following points."""
+    return observation.observation_std**2
+
+
+def _discretization_variance(observation: Observation) -> np.ndarray:
+    """By how much one grid more may differ."""
+    return observation.residual_std**2 - observation.observation_std**2
 
 
 def _grid_change(result: RefineResult, fitted: ModelFit) -> float | None:
