@@ -8,7 +8,7 @@ from refined_by_hand import document
 
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig
-from masiv.refinement.answer import answer, grid_advice
+from masiv.refinement.answer import advice, answer
 from masiv.report.quantities import millimetres, percent, quantity
 from masiv.report.sections.answer import Agreement, answer_cards
 from masiv.scene.scene import Ground
@@ -95,14 +95,15 @@ def test_an_answer_that_is_none_is_marked(verdict):
 
 
 def test_what_cannot_be_told_is_told_apart_from_what_may_act():
-    """The advice to simulate more particles comes only where the grid hides as much as is left."""
+    """Advice comes only where errors that are expected hide as much as is left; it names the larger ones."""
     sets = [{"effects": ["viscosity"], "probability": 0.93}, {"effects": [], "probability": 0.07}]
     found = document(accepted=[], verdict="cannot tell", credible_set=sets, discretization_mm={"fit": 10.7})
     assert answer(found) == "cannot tell: viscosity 0.93, no effect 0.07"
     _, _, _, sure = answer_cards(twin(), None, [found], [])
     assert "refine.particles" in sure.lines[-1]
-    assert grid_advice(found | {"discretization_mm": {"fit": 10.6}}) is None
-    assert grid_advice(found | {"verdict": "nothing missing"}) is None
+    assert "more cameras" in (advice(found | {"observation_error_mm": {"fit": 10.8}}) or "")
+    assert advice(found | {"discretization_mm": {"fit": 10.6}}) is None
+    assert advice(found | {"verdict": "nothing missing"}) is None
     assert answer(found | {"credible_set": sets[:1]}) == "cannot tell"
 
 

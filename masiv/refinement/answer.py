@@ -24,14 +24,20 @@ def together(terms: Sequence[str]) -> str:
     return " and ".join(f"{name} ({scope})" if scope else name for name, scope in told) or "no effect"
 
 
-def grid_advice(document: Mapping[str, Any]) -> str | None:
-    """What to do if it cannot be told and what another grid would change is as large as the residual; else None."""
-    grid, residual = document["discretization_mm"]["fit"] or 0.0, document["residual_mm"]["fit"]
-    if document["verdict"] != "cannot tell" or grid < residual:
+def advice(document: Mapping[str, Any]) -> str | None:
+    """What hides an effect, and what to do, if it cannot be told and errors as large as the residual are expected: of
+    the observation, or of the simulation's grid, whichever is larger; else None."""
+    observation, grid = (document[key]["fit"] or 0.0 for key in ("observation_error_mm", "discretization_mm"))
+    if document["verdict"] != "cannot tell" or max(observation, grid) < document["residual_mm"]["fit"]:
         return None
+    if grid > observation:
+        return (
+            "what another grid of the simulation would change is as large as the residual: more particles may tell "
+            "(refine.particles; of tracks, tracks.particles)"
+        )
     return (
-        "what another grid of the simulation would change is as large as the residual: more particles may tell "
-        "(refine.particles; of tracks, tracks.particles)"
+        "the expected error of the observation is as large as the residual: more cameras, a finer texture or a stronger "
+        "motion may tell"
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from masiv.inference.model_fit import PARTS
-from masiv.refinement.answer import answer, grid_advice, outcome, together
+from masiv.refinement.answer import advice, answer, outcome, together
 from masiv.refinement.result import RANKED
 from masiv.refinement.support import question
 
@@ -85,8 +85,8 @@ def text(document: Mapping[str, Any]) -> str:
             f"{_vector(n['initial_velocity'])} m/s with a spin of {_vector(n['initial_omega'])} rad/s would set them "
             f"{n['predicted_difference_mm']:.0f} mm apart"
         )
-    advice = grid_advice(shown)
-    lines += [advice] if advice else []
+    told = advice(shown)
+    lines += [told] if told else []
     lines += [f"problem: {problem}" for problem in shown.get("problems", ())]
     return "\n".join([*lines, answer(shown)])
 

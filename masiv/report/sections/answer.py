@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from masiv.refinement.answer import grid_advice, together, words
+from masiv.refinement.answer import advice, together, words
 from masiv.report.page import Card
 from masiv.report.quantities import millimetres, percent, quantity
 
@@ -195,8 +195,8 @@ def _how_sure(twin: Twin, material: Mapping[str, Any] | None, refined: Sequence[
             )
         elif document["verdict"] != "ranked only":
             lines += _probabilities(document)
-        advice = grid_advice(document)
-        lines += [f"{where}{_upper(advice)}."] if advice else []
+        told = advice(document)
+        lines += [f"{where}{_upper(told)}."] if told else []
     doubtful = any(document["verdict"] not in ("effect added", "nothing missing") for document in refined)
     answer = "; ".join(dict.fromkeys(_upper(document["verdict"]) for document in refined))
     return Card(question, answer, lines, open=doubtful)
