@@ -36,8 +36,8 @@ def advice(document: Mapping[str, Any]) -> str | None:
             "(refine.particles; of tracks, tracks.particles)"
         )
     return (
-        "the expected error of the observation is as large as the residual: more cameras, a finer texture or a stronger "
-        "motion may tell"
+        "the expected error of the observation is as large as the residual: more cameras, a finer texture or a "
+        "stronger motion may tell"
     )
 
 
