@@ -47,7 +47,7 @@ STRENGTHS = {
 
 PAIRS = (
     ("quadratic_drag", "restitution"), ("body_force", "viscosity"), ("linear_drag", "swirl"),
-    ("quadratic_drag", "point_mass"), ("ground_friction", "restitution"), ("body_force", "ground_friction"),
+    ("quadratic_drag", "point_mass"), ("ground_friction", "quadratic_drag"), ("body_force", "ground_friction"),
     ("linear_drag", "periodic_force"), ("body_force", "stiffness_contrast"), ("ground_friction", "viscosity"),
     ("body_force", "restitution"),
 )  # fmt: skip

@@ -118,6 +118,38 @@ def test_it_bobs_like_a_fixed_mass_and_swings_like_a_weight_without_inertia():
     assert np.abs(fixed[:, 0] - weight[:, 0]).max() > 0.3 * swing
 
 
+def test_without_a_thread_it_is_fixed_to_the_body():
+    """At the middle of a face: it stays where it is tied, slows the body in all directions, and falls with it."""
+    x, mass = body(height=5.0), 2.0
+    place = (0.2, 5.1, 0.1)
+    m = 8.0 / len(x)
+    pushed = at_rest(x, (0.3, -0.1, 0.2))
+    state = type(pushed)(*pushed.tensors(), suspended=torch.tensor([place, (0.0, 0.0, 0.0)], dtype=F64))
+    found = active(x, mass, 0.0, place)
+    taken = run(x, found, 300, state=state, gravity=(0, 0, 0))
+    end, (y, u) = taken.final, taken.final.suspended
+    start = m * pushed.velocity.sum(0)
+    torch.testing.assert_close(m * end.velocity.sum(0) + mass * u, start, rtol=0, atol=1e-9)
+    weights = tied_weights(x, torch.tensor(place, dtype=F64), 0.2 / 8)
+    torch.testing.assert_close((weights[:, None] * end.position).sum(0), y, rtol=0, atol=1e-4)
+    torch.testing.assert_close((weights[:, None] * end.velocity).sum(0), u, rtol=0, atol=5e-2)
+    falling = run(x, found, 100).final
+    fall = torch.tensor([0.0, -0.5 * G * (100 * DT) * (101 * DT), 0.0], dtype=F64)
+    torch.testing.assert_close(falling.position, x + fall, rtol=0, atol=1e-9)
+
+
+def test_a_mass_fixed_inside_moves_the_body_as_a_point_mass_does():
+    x, mass, steps = body(height=5.0, count=400), 2.0, 400
+    place, held = (0.1, 5.02, 0.1), 5.15
+    pushed = at_rest(x, (0.3, 0.0, 0.0))
+    fixed = end_of(x, place, active(x, mass, 0.0, place, held_above=held), steps, pushed)
+    within = end_of(x, place, active(x, None, others=[("point_mass", (mass, *place))], held_above=held), steps, pushed)
+    alone = end_of(x, place, active(x, None, held_above=held), steps, pushed)
+    apart = np.abs(alone - within).max(0)
+    assert (apart[:2] > 5e-3).all()
+    np.testing.assert_allclose(fixed[:, :2], within[:, :2], atol=0.2 * apart[:2].min())
+
+
 @pytest.mark.parametrize("place", [(0.1, 5.1, 0.1), (0.21, 5.1, 0.1), (0.1, 4.98, 0.1)])
 def test_weights_of_a_tie_have_its_place_as_their_mean(place):
     """Also at a face, where no weights that are positive do."""

@@ -135,7 +135,8 @@ class ForceEffect(Effect):
 
 @dataclass(frozen=True)
 class SuspendedMass:
-    """mass [kg] on an inextensible thread of length [m], tied to the particles with weights (N,) of sum 1."""
+    """mass [kg] on an inextensible thread of length [m], tied to the particles with weights (N,) of sum 1; fixed to
+    them if the length is 0."""
 
     mass: float
     length: float
@@ -144,8 +145,8 @@ class SuspendedMass:
 
 class SuspendedMassEffect(Effect):
     r"""$v_p \leftarrow v_p + w_p \lambda n / m_p$ at each particle $p$, $u \leftarrow u + \Delta t\, g - \lambda n / M$
-    with the impulse $\lambda$ of a thread along $n$: a mass $M$ with the velocity $u$ hangs from the body. At most one
-    may act. A rollout with it has no gradient."""
+    with the impulse $\lambda$ of a thread along $n$, or, without a thread, of a joint in any direction: a mass $M$
+    with the velocity $u$ hangs from the body. At most one may act. A rollout with it has no gradient."""
 
     @abstractmethod
     def suspended_mass(self, theta: torch.Tensor, context: EffectContext) -> SuspendedMass:

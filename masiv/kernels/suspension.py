@@ -1,4 +1,4 @@
-"""A mass that hangs on a thread: an inextensible one, which pulls and does not push."""
+"""A mass that hangs on a thread: an inextensible one, which pulls and does not push. Or one that is fixed to a body."""
 
 import taichi as ti
 
@@ -8,7 +8,8 @@ from masiv.kernels.grid import DT
 @ti.data_oriented
 class SuspensionKernels:
     """``place[s]``, ``velocity[s]`` (3,) [m, m/s]: of the mass before substep s. ``weights[p]``: of the particles that
-    the thread is tied to, with sum 1. ``load`` [kg] and ``length`` [m] of the thread."""
+    the thread is tied to, with sum 1. ``load`` [kg] and ``length`` [m] of the thread; without length the
+    mass is fixed to where it is tied."""
 
     def __init__(self, mpm):
         self.mpm = mpm
@@ -41,17 +42,24 @@ class SuspensionKernels:
         """The mass before substep s from that before s - 1, and the impulse of the thread on it and on the particles.
 
         With the impulse the ends are not further apart than the thread is long after substep s, but for what the grid
-        shares out of the particles' part of it: of the order of the substep squared."""
+        shares out of the particles' part of it: of the order of the substep squared. Without a thread the impulse acts
+        in all directions, and the ends are at one place."""
         dt, load = self.mpm.constants[DT], self.load[None]
         x, v, mobility = self.knot(s, count)
         place, u = self.place[s - 1] + dt * self.velocity[s - 1], self.velocity[s - 1] + dt * self.mpm.gravity()
-        line = place - x
-        distance = line.norm()
-        along = line / ti.max(distance, 1e-9)
-        parting = (u - v).dot(along) + (distance - self.length[None]) / dt
-        taken = ti.max(parting, 0.0) / (1.0 + load * mobility)
-        self.place[s], self.velocity[s] = place, u - taken * along
-        impulse = (load * taken) * along
+        taken = ti.Vector.zero(self.mpm.real, 3)
+        if self.length[None] > 0.0:
+            line = place - x
+            distance = line.norm()
+            along = line / ti.max(distance, 1e-9)
+            parting = (u - v).dot(along) + (distance - self.length[None]) / dt
+            taken = (ti.max(parting, 0.0) / (1.0 + load * mobility)) * along
+        else:
+            # Its path has the order of the particles' (velocity, then place): they fall together to the last digit.
+            taken = (self.place[s - 1] + dt * u - x) / (dt * (1.0 + load * mobility))
+            place = self.place[s - 1] + dt * (u - taken)
+        self.place[s], self.velocity[s] = place, u - taken
+        impulse = load * taken
         for p in range(count):
             if self.weights[p] != 0.0:
                 self.mpm.velocity[s, p] += (self.weights[p] / self.mpm.particle_mass[p]) * impulse
