@@ -367,3 +367,19 @@ def test_a_baseline_that_cannot_be_simulated_does_not_end_the_search():
     assert [t.name for t in result.accepted] == ["linear_drag"]
     with pytest.raises(MasivError, match="cannot be simulated here"):
         refine(fragile, [bad, bad], settings())
+
+
+def test_what_was_accepted_first_is_exchanged_once_the_others_are_known():
+    """The first effect stands for both that act; with the second one known, another fits better in its place."""
+    both = EFFECTS["linear_drag"] + 0.7 * EFFECTS["gravity_scale"] + 0.02 * EFFECTS["viscosity"]
+    patterns = {**{n: EFFECTS[n] for n in ("linear_drag", "gravity_scale")}, "quadratic_drag": both}
+    model = LinearModel({"linear_drag.strength": 0.5, "gravity_scale.strength": 0.4}, effects=patterns)
+    result = refined(model)
+    assert result.search.rounds[0].accepted.effect == "quadratic_drag"
+    assert {t.name for t in result.accepted} == {"linear_drag", "gravity_scale"}
+    (exchange,) = (x for r in result.search.rounds for x in r.exchanges)
+    assert (exchange.old, exchange.new) == ("quadratic_drag", "linear_drag")
+    assert exchange.log_bayes_factor > 0
+    assert result.after.values["linear_drag.strength"] == pytest.approx(0.5, abs=0.02)
+    written = document(result)
+    assert "exchanged quadratic drag for linear drag" in text(written)

@@ -212,11 +212,12 @@ def _errors(result: RefineResult, fitted: ModelFit) -> dict[str, Any]:
 
 
 def _round(result: RefineResult, done: Round) -> dict[str, Any]:
-    """The refits that competed, best first, and what could not be simulated."""
+    """The refits that competed, best first, what could not be simulated, and effects that were exchanged after it."""
     return {
         "base": {"law": done.base.model.family.kind, "effects": list(done.base.model.effects)},
         "refits": [_refit(result, done, t) for t in done.trials],
         "not_fitted": [{**_failure(result, f.effect, f.reason), "law": f.law} for f in done.failures],
+        "exchanges": [{"old": x.old, "new": x.new, "log_bayes_factor": x.log_bayes_factor} for x in done.exchanges],
     }
 
 

@@ -46,6 +46,11 @@ def text(document: Mapping[str, Any]) -> str:
     for done in shown["rounds"]:
         lines += [_refit_line(r) for r in done["refits"]]
         lines += [f"  refit {f['effect']} ({f['law']}): {f['reason']}" for f in done["not_fitted"]]
+        lines += [
+            f"  exchanged {together([x['old']])} for {together([x['new']])}: log Bayes factor "
+            f"{x['log_bayes_factor']:.1f}"
+            for x in done.get("exchanges", ())
+        ]
     for a in shown["accepted"]:
         values = ", ".join(f"{n} {v:.4g}{_plus_minus(a['stderr'][n])} {a['unit'][n]}" for n, v in a["theta"].items())
         lines.append(f"{a['effect']}: {values}" + _looks_like(a["indistinguishable_from"]))

@@ -53,6 +53,13 @@ class Hypothesis:
         spread = np.sqrt(np.diag(self.marginal.covariance)[own])
         return float((np.abs(self.marginal.mean[own]) / spread).max(initial=0.0))
 
+    def mean_values(self, values: Mapping[str, float]) -> dict[str, float]:
+        """``values``, at which the model was linearised, moved to the mean of the posterior, within the bounds of its
+        parameters."""
+        changes = zip(self.linear.parameters, self.marginal.mean, strict=False)
+        moved = {p.name: p.value(p.fitted(values[p.name]) + float(d)) for p, d in changes if p.name in values}
+        return {**values, **moved}
+
     def with_posterior(self) -> ModelFit:
         """The fit with the standard errors of the posterior, errors of law, initial state and noise included."""
         names = [p.name for p in self.linear.parameters]

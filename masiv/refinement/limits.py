@@ -50,12 +50,9 @@ def sensitivity(
     return values, linear_model(forward_model, at.model.with_effect(name), values, term.strengths, fields)
 
 
-def upper_limit(
-    evidence: Evidence, at: LinearModel, terms: Sequence[EffectTerm], term: EffectTerm, here: Marginal,
-    found: tuple[dict[str, float], LinearModel],
-) -> UpperLimit:  # fmt: skip
-    """The limit of ``term`` in addition to the model ``at``, with the effects ``terms`` and the evidence ``here``."""
-    values, columns = found
+def extended(at: LinearModel, term: EffectTerm, values: dict[str, float], columns: LinearModel) -> LinearModel:
+    """``at`` with ``term``, of which ``columns`` are the derivatives at ``values``, see ``sensitivity``; without the
+    parameters that it replaces."""
     joined = at.with_parameters(columns.model, values, columns)
     own = {p.name for p in columns.parameters}  # gravity is known to a part without being an effect
     gone = {p.name for p in at.parameters} & own
@@ -64,11 +61,20 @@ def upper_limit(
         for k, p in enumerate(joined.parameters)
         if p.name not in term.replaces_parameter and (k >= len(at.parameters) or p.name not in gone)
     ]
-    joined = replace(
+    return replace(
         joined,
         parameters=tuple(joined.parameters[k] for k in kept),
         jacobians=[j[..., kept] for j in joined.jacobians],
     )
+
+
+def upper_limit(
+    evidence: Evidence, at: LinearModel, terms: Sequence[EffectTerm], term: EffectTerm, here: Marginal,
+    found: tuple[dict[str, float], LinearModel],
+) -> UpperLimit:  # fmt: skip
+    """The limit of ``term`` in addition to the model ``at``, with the effects ``terms`` and the evidence ``here``."""
+    columns = found[1]
+    joined = extended(at, term, *found)
     whole = evidence.marginal(joined, [*terms, term], near=here)
     priors = evidence.priors(joined, [*terms, term])
     names = [p.name for p in joined.parameters]

@@ -70,10 +70,8 @@ class _Point:
 
     def moved(self, forward_model: ForwardModel, robust_scale: float) -> ModelFit:
         """The fit at the mean of the posterior, within the bounds of its parameters. Raises NonFiniteError."""
-        fitted, values = self.hypothesis.fitted, dict(self.hypothesis.fitted.values)
-        for p, change in zip(self.hypothesis.linear.parameters, self.hypothesis.marginal.mean, strict=False):
-            if p.name in values:
-                values[p.name] = p.value(p.fitted(values[p.name]) + float(change))
+        fitted = self.hypothesis.fitted
+        values = self.hypothesis.mean_values(fitted.values)
         return evaluate_fit(
             forward_model, fitted.model, fitted.parameters, values, fitted.jacobian, robust_scale=robust_scale
         )

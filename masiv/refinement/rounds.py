@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -9,7 +10,7 @@ from masiv.inference.model_fit import ModelFit, rank_by_bic
 from masiv.inference.predictive import Forecast
 from masiv.models.base import ForwardModel
 from masiv.refinement.candidates import Candidate, Ranking
-from masiv.refinement.hypotheses import Posterior
+from masiv.refinement.hypotheses import CREDIBLE, Posterior
 from masiv.refinement.limits import UpperLimit
 
 
@@ -46,9 +47,20 @@ class Failure:
 
 
 @dataclass(frozen=True)
+class Exchange:
+    """``new`` acts in place of the effect ``old``, which was accepted when others were still missing.
+    log_bayes_factor: for that."""
+
+    old: str
+    new: str
+    log_bayes_factor: float
+
+
+@dataclass(frozen=True)
 class Round:
     """One pass: what was tried on top of which model. trials: most probable first; accepted: one of them, or None.
-    posterior: over the models with and without one effect more, None if none was fitted."""
+    posterior: over the models with and without one effect more, None if none was fitted. exchanges: of effects that
+    were accepted before, with the one accepted here."""
 
     base: ModelFit
     ranking: Ranking
@@ -56,6 +68,7 @@ class Round:
     accepted: Trial | None
     posterior: Posterior | None = None
     failures: tuple[Failure, ...] = ()
+    exchanges: tuple[Exchange, ...] = ()
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -110,4 +123,8 @@ def alternatives(name: str, after: ModelFit, rounds: Sequence[Round]) -> dict[st
         if len(effects) == len(rest) + 1 and rest <= effects and name not in effects:
             (other,) = effects - rest
             out[other] = p
+    for exchange in (x for r in accepting for x in r.exchanges):
+        p = 1 / (1 + math.exp(min(exchange.log_bayes_factor, 700.0)))
+        if exchange.new == name and p > 1 - CREDIBLE:
+            out[exchange.old] = p
     return out

@@ -15,6 +15,7 @@ from masiv.inference.robust import robust_scale_of
 from masiv.models.base import ForwardModel
 from masiv.refinement.discrepancy import discrepancy_force
 from masiv.refinement.effect_fit import BROYDEN_STEPS
+from masiv.refinement.exchange import with_exchanges
 from masiv.refinement.hypotheses import log_prior
 from masiv.refinement.limits import UpperLimit, sensitivity, upper_limit
 from masiv.refinement.posterior_fit import posterior_fit
@@ -139,8 +140,16 @@ def _add_effects(
         settings.progress("refine: fit whitened residuals", 0, 1, "")
         state, rivals = state.with_fit(done.accepted.fitted).whitened_again(_rivals(done), settings.workers)
         settings.progress("refine: fit whitened residuals", 1, 1, "")
+        state, exchanges = with_exchanges(state, _places(rounds[0]), settings)
+        if exchanges:
+            rounds[-1], rivals = replace(done, exchanges=exchanges), []
         bases = [state.fit, *rivals]
     return state, rounds
+
+
+def _places(first: Round) -> dict[str, dict[str, float]]:
+    """Where the first ranking saw effects: their parameters."""
+    return {c.effect: dict(c.theta) for c in first.candidates}
 
 
 def _settled(
@@ -210,7 +219,7 @@ def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchS
     """Of all effects that could act in addition to ``state.fit``, at the places where the first ranking saw them."""
     model, fitted = state.forward_model, state.fit
     names = settings.considered(model, fitted.model)
-    places = {c.effect: c.theta for c in rounds[0].candidates} if rounds else {}
+    places = _places(rounds[0]) if rounds else {}
     line = settings.linearizations.of(model, fitted)
     terms = [model.term(n) for n in fitted.model.effects]
     evidence = Evidence.of(model.observations, line.fields)

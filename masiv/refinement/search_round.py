@@ -167,7 +167,7 @@ def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Tr
         model, start.model, start.values, budget=2 * len(start.parameters) + 6, robust_scale=state.robust_scale,
         held=held_parameters(model, start),
     )  # fmt: skip
-    best = _with_free_places(state, min(final, start, key=lambda f: f.cost))
+    best = with_free_places(state, min(final, start, key=lambda f: f.cost))
     hypotheses, failed = _weighed(state, [best], [], settings)
     if not hypotheses:
         return replace(trial, fitted=best, impossible=(f"at its best fit, {failed[id(best)]}",))
@@ -175,7 +175,7 @@ def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Tr
     return replace(done, impossible=tuple(reasons_against(model, done)))
 
 
-def _with_free_places(state: SearchState, fitted: ModelFit) -> ModelFit:
+def with_free_places(state: SearchState, fitted: ModelFit) -> ModelFit:
     """``fitted`` with what was left at a guess fitted as well, if the information criterion asks for it."""
     if not held_parameters(state.forward_model, fitted):
         return fitted
