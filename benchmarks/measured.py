@@ -5,7 +5,7 @@
     python benchmarks/measured.py damping --particles 400 1000 1728 --youngs 310e3 --viscosity 250
     python benchmarks/measured.py load --youngs 306.4e3 --viscosity 203
     python benchmarks/measured.py creep --duration 3.5 --particles 400 [--held-straight] [--fractions 0.1 0.2]
-                                        [--effects point_mass hung_mass]
+                                        [--effects point_mass hung_mass] [--thread 0]
 
 The measurements are in the folder that MASIV_MEASURED names, ../shared/measured beside the repository by default. They
 are public: see benchmarks/measured.md.
@@ -257,10 +257,12 @@ def creep(
     held_straight: bool,
     fractions: Sequence[float],
     effects: Sequence[str],
+    thread: float,
 ) -> dict:
     """Law with Maxwell branches from gravity_a alone, over ``duration`` [s] after its release, with ``fractions`` of
     the branches to start from and the modulus ``youngs`` [Pa] at the frequency of its swing; with the best one, each
-    of ``effects``, tied to the middle of the end of the loaded beam, from load52_a. gravity_b and load52_b are held
+    of ``effects``, tied to the middle of the end of the loaded beam, from load52_a; a hung mass on a ``thread`` [m] of
+    that length at first, fixed if it is 0. gravity_b and load52_b are held
     out. moduli: of uniaxial tension, three times those of shear."""
     import torch
 
@@ -312,13 +314,14 @@ def creep(
     given = known | {n: law.values[n] for n in ("youngs_modulus", *names)}
     loads = {}
     for name in effects:
-        start = {"hung_mass.length": THREAD} if name == "hung_mass" else {}
+        start = {"hung_mass.length": thread} if name == "hung_mass" else {}
         began = time.perf_counter()
         simulation = clamped_body_model(tracks, "load52", settings, config, known=given)
         place = max(simulation.term(name).guesses, key=lambda guess: guess[2])  # along the body, from the clamp
         at = dict(zip((f"{name}.{axis}" for axis in "xyz"), place, strict=False))
         model = Model(family_of("neo_hookean", 1070, given), "none", ("relaxation", name))
-        load = gauss_newton_fit(simulation, model, {f"{name}.mass": 0.03, **start, **at}, budget=60, held=frozenset(at))
+        held = frozenset(at) | (frozenset() if thread else start.keys())  # without a thread it is fixed
+        load = gauss_newton_fit(simulation, model, {f"{name}.mass": 0.03, **start, **at}, budget=60, held=held)
         loads[name] = row(began, simulation, load)
     return found | {"load52": loads}
 
@@ -343,6 +346,7 @@ def main() -> None:
     parser.add_argument("--held-straight", action="store_true", help="of creep: the shape before the release is known")
     parser.add_argument("--fractions", type=float, nargs="+", default=[0.1, 0.2], help="of creep: starts of its fit")
     parser.add_argument("--effects", nargs="+", help="of load and creep")
+    parser.add_argument("--thread", type=float, default=THREAD, help="of creep: length at first [m]; 0: it is fixed")
     asked = parser.parse_args()
     source = data_folder()
     if not source.is_dir():
@@ -377,6 +381,7 @@ def main() -> None:
             asked.held_straight,
             asked.fractions,
             asked.effects or ["point_mass", "hung_mass"],
+            asked.thread,
         )
     else:
         found = balls(source / "ball_drops")

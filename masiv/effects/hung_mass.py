@@ -9,12 +9,12 @@ from masiv.effects.effect import SuspendedMass, SuspendedMassEffect
 from masiv.effects.places import PLACE, as_guesses, face_centres, spacing_of, tied_weights
 from masiv.effects.search_hints import SearchHints
 
-LENGTHS = (0.0, 0.5, 2.0)
+LENGTHS = (0.0, 1.0)
 """Of threads that a search tries, in sizes of the body; without length the mass is fixed."""
 
 
 def _guesses(context: EffectContext) -> list[tuple[float, ...]]:
-    """At the centres of the body's faces, fixed, on a short and on a long thread. The matter of the outermost particles
+    """At the centres of the body's faces, fixed and on a thread. The matter of the outermost particles
     ends half a spacing further out."""
     outermost = face_centres(context.rest)
     outwards = torch.stack([side * axis for axis in torch.eye(3) for side in (-1, 1)]).to(outermost)
