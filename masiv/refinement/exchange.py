@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from masiv.errors import NonFiniteError
 from masiv.inference.evidence import Evidence
 from masiv.inference.linear_model import LinearModel
 from masiv.inference.model_fit import ModelFit, gauss_newton_fit, held_parameters
@@ -73,7 +74,10 @@ def _best_exchange(
     were exchanged already."""
     model, here = state.forward_model, state.fit
     settings.progress("refine: exchange effects", 0, 1, "")
-    line = settings.linearizations.of(model, here)
+    try:
+        line = settings.linearizations.of(model, here)
+    except NonFiniteError:  # a round can do without the derivatives of its base, an exchange cannot
+        return None
     fits = {}
     for old, new, values in _probable(state, line, places, settings, gone)[:FITTED]:
         other = _without(here.model, old).with_effect(new)
