@@ -8,8 +8,8 @@ import pytest
 
 from masiv.memory import PeakMemory, taken_bytes
 
-LARGE = 200_000_000
-"""[bytes]"""
+LARGE = 400_000_000
+"""[bytes], well above what an interpreter with numpy takes."""
 
 
 @pytest.mark.slow
