@@ -262,8 +262,8 @@ def creep(
     """Law with Maxwell branches from gravity_a alone, over ``duration`` [s] after its release, with ``fractions`` of
     the branches to start from and the modulus ``youngs`` [Pa] at the frequency of its swing; with the best one, each
     of ``effects``, tied to the middle of the end of the loaded beam, from load52_a; a hung mass on a ``thread`` [m] of
-    that length at first, fixed if it is 0. gravity_b and load52_b are held
-    out. moduli: of uniaxial tension, three times those of shear."""
+    that length at first, fixed if it is 0. gravity_b and load52_b are held out. moduli: of uniaxial tension, three
+    times those of shear."""
     import torch
 
     from masiv.effects.relaxation import BRANCHES, TIMES, shear_moduli

@@ -21,7 +21,7 @@ def document(**changes):
     }  # fmt: skip
     refused = refit | {"effect": "swirl", "accepted": False, "impossible": ["it <cannot> be"], "parameters": {}}
     whole = {
-        "schema": 4, "null_probability": 0.0021, "predictive_p": {"before": 0.004, "after": 0.6},
+        "schema": 5, "null_probability": 0.0021, "predictive_p": {"before": 0.004, "after": 0.6},
         "unknown_probability": 0.03, "test": {"after": {"rmse_mm": 15.0, "expected_rmse_mm": 17.5, "log_density": 3.0}},
         "credible_set": [{"effects": ["linear_drag"], "probability": 0.97}],
         "upper_limits": [{"effect": "restitution", "scope": "all", "strength": 0.0345, "unit": "1", "motion_mm": 2.25,

@@ -62,7 +62,7 @@ def write_run(folder: Path) -> RunFolder:
         contact="sticky", volume=0.027, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(),
     ).save(folder)  # fmt: skip
     write_json(folder / MATERIAL, {"schema": 1, "summary": "soft"})
-    write_json(folder / REFINED, {"schema": 4})
+    write_json(folder / REFINED, {"schema": 5})
     names = ("before", "after", "observed", "points", "times", "fit_count", "test_count")
     write_npz(folder / FIELDS, observations=["a"], **{f"{name}@a": np.zeros(3) for name in names})
     write_json(run.metrics, {"schema": 1})

@@ -10,12 +10,13 @@ from masiv.effects.places import PLACE, as_guesses, face_centres, spacing_of, ti
 from masiv.effects.search_hints import SearchHints
 
 LENGTHS = (0.0, 1.0)
-"""Of threads that a search tries, in sizes of the body; without length the mass is fixed."""
+"""Of threads that a search tries, in sizes of the body; without length the mass is fixed. Chosen: no body asked for
+these."""
 
 
 def _guesses(context: EffectContext) -> list[tuple[float, ...]]:
-    """At the centres of the body's faces, fixed and on a thread. The matter of the outermost particles
-    ends half a spacing further out."""
+    """At the centres of the body's faces, fixed and on a thread. The matter of the outermost particles ends half a
+    spacing further out."""
     outermost = face_centres(context.rest)
     outwards = torch.stack([side * axis for axis in torch.eye(3) for side in (-1, 1)]).to(outermost)
     faces = outermost + 0.5 * spacing_of(context.rest) * outwards
@@ -28,11 +29,10 @@ class HungMass(SuspendedMassEffect):
     fixed there, $y = \sum_p w_p x_p$, with forces in all directions.
 
     The weights are those of ``PointMass``, corrected so that their mean is the place at a face, too: a mass at the very
-    face, where ``PointMass`` has no matter to put it on. The thread does
-    not stretch, has no weight and can go slack, so the mass loads the body by its weight and takes part in its motion
-    along the thread only; across it, it swings as a pendulum with the period $2 \pi \sqrt{L / |g|}$. At frame 0 it
-    hangs straight down and moves with that matter. It meets neither the body nor the ground. A rollout with it has no
-    gradient. Looked for in clamped bodies, on request.
+    face, where ``PointMass`` has no matter to put it on. The thread does not stretch, has no weight and can go slack:
+    the mass loads the body by its weight and takes part in its motion along the thread only; across it, it swings as a
+    pendulum with the period $2 \pi \sqrt{L / |g|}$. At frame 0 it hangs straight down and moves with that matter. It
+    meets neither the body nor the ground. A rollout with it has no gradient. Looked for in clamped bodies, on request.
     """
 
     name = "hung_mass"

@@ -24,7 +24,7 @@ from masiv.refinement.rounds import Round, Trial, alternatives
 from masiv.refinement.support import carried_weight, carried_weight_stderr
 from masiv.refinement.world_vectors import vectors_in_world
 
-SCHEMA = 4
+SCHEMA = 5
 WORST_POINTS = 0.1
 """Part of the points whose middle is the place where a residual is largest."""
 

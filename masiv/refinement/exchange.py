@@ -19,15 +19,16 @@ from masiv.models.base import EffectTerm, ForwardModel, Model
 from masiv.refinement.hypotheses import NEGLIGIBLE, Hypothesis, evidence_of, weighed
 from masiv.refinement.limits import extended, sensitivity
 from masiv.refinement.rounds import Exchange
-from masiv.refinement.search_round import parameters_at_bounds, with_free_places
+from masiv.refinement.search_round import reasons_against, with_free_places
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks
 from masiv.workers import TaskError
 
 FITTED = 2
-"""Exchanges that are fitted through the rollout, of those that are probable by the linear model."""
+"""Exchanges that are fitted through the rollout, of those that are probable by the linear model. Chosen."""
 DERIVATIVES = 4
-"""Jacobians that the fit of one may take: it starts where a linear model ends that was made with another effect."""
+"""Jacobians that the fit of one may take: it starts where a linear model ends that was made with another effect.
+Chosen."""
 
 
 def with_exchanges(
@@ -88,9 +89,7 @@ def _best_exchange(
     possible = {
         pair: with_free_places(state, fit)
         for pair, fit in fitted.items()
-        if not isinstance(fit, TaskError)
-        and not model.impossible(fit, model.term(pair[1]))
-        and not parameters_at_bounds(fit, model.term(pair[1]))
+        if not isinstance(fit, TaskError) and not reasons_against(model, fit, pair[1])
     }
     settings.progress("refine: exchange effects", 1, 1, ", ".join(f"{old} for {new}" for old, new in possible))
     lines = zip(possible.items(), settings.linearizations.each(model, list(possible.values())), strict=True)

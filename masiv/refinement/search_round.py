@@ -47,7 +47,9 @@ def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSet
     if settings.rank_only:
         return Round(current, ranking, (), None, failures=attempts.failures)
     trials = [
-        replace(t, impossible=tuple(reasons_against(state.forward_model, t)), converged=converged(t, bases))
+        replace(
+            t, impossible=tuple(reasons_against(state.forward_model, t.fitted, t.effect)), converged=converged(t, bases)
+        )
         for t in trials
     ]
     return _judged(state.with_fit(current), bases, trials, replace(attempts, ranking=ranking), settings)
@@ -61,10 +63,10 @@ def _with_inapplicable(state: SearchState, ranking: Ranking, settings: SearchSet
     return replace(ranking, not_ranked={**ranking.not_ranked, **others})
 
 
-def reasons_against(forward_model: ForwardModel, trial: Trial) -> list[str]:
-    """Why the effect of ``trial`` cannot act as it was fitted; empty if it can."""
-    term = forward_model.term(trial.effect)
-    return [*forward_model.impossible(trial.fitted, term), *parameters_at_bounds(trial.fitted, term)]
+def reasons_against(forward_model: ForwardModel, fitted: ModelFit, name: str) -> list[str]:
+    """Why the term ``name`` cannot act as it was fitted; empty if it can."""
+    term = forward_model.term(name)
+    return [*forward_model.impossible(fitted, term), *parameters_at_bounds(fitted, term)]
 
 
 def parameters_at_bounds(fitted: ModelFit, term: EffectTerm) -> list[str]:
@@ -172,7 +174,7 @@ def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Tr
     if not hypotheses:
         return replace(trial, fitted=best, impossible=(f"at its best fit, {failed[id(best)]}",))
     done = replace(trial, fitted=hypotheses[0].with_posterior())
-    return replace(done, impossible=tuple(reasons_against(model, done)))
+    return replace(done, impossible=tuple(reasons_against(model, done.fitted, done.effect)))
 
 
 def with_free_places(state: SearchState, fitted: ModelFit) -> ModelFit:
