@@ -6,6 +6,8 @@ import json
 
 import numpy as np
 
+from masiv.refinement.answer import SCHEMA
+
 ERRORS = {
     "fit": {"frames": [0, 11], "trajectory_rmse_mm": 10.7, "chamfer_1e3mm2": 0.31},
     "validation": {"frames": [12, 15], "trajectory_rmse_mm": 40.2},
@@ -21,7 +23,7 @@ def document(**changes):
     }  # fmt: skip
     refused = refit | {"effect": "swirl", "accepted": False, "impossible": ["it <cannot> be"], "parameters": {}}
     whole = {
-        "schema": 5, "null_probability": 0.0021, "predictive_p": {"before": 0.004, "after": 0.6},
+        "schema": SCHEMA, "null_probability": 0.0021, "predictive_p": {"before": 0.004, "after": 0.6},
         "unknown_probability": 0.03, "test": {"after": {"rmse_mm": 15.0, "expected_rmse_mm": 17.5, "log_density": 3.0}},
         "credible_set": [{"effects": ["linear_drag"], "probability": 0.97}],
         "upper_limits": [{"effect": "restitution", "scope": "all", "strength": 0.0345, "unit": "1", "motion_mm": 2.25,

@@ -15,6 +15,7 @@ from masiv.files import write_json, write_npz
 from masiv.materials.classical import ClassicalLaw
 from masiv.mpm.config import SimulatorConfig
 from masiv.observations.kept_masks import KeptMasks
+from masiv.refinement.answer import SCHEMA
 from masiv.report.sections.material import MATERIAL
 from masiv.report.sections.refinement import FIELDS, REFINED
 from masiv.runfolder import Request, RunFolder
@@ -62,7 +63,7 @@ def write_run(folder: Path) -> RunFolder:
         contact="sticky", volume=0.027, density=1000.0, up=UP, fps=FPS, law=law, simulator=SimulatorConfig(),
     ).save(folder)  # fmt: skip
     write_json(folder / MATERIAL, {"schema": 1, "summary": "soft"})
-    write_json(folder / REFINED, {"schema": 5})
+    write_json(folder / REFINED, {"schema": SCHEMA})
     names = ("before", "after", "observed", "points", "times", "fit_count", "test_count")
     write_npz(folder / FIELDS, observations=["a"], **{f"{name}@a": np.zeros(3) for name in names})
     write_json(run.metrics, {"schema": 1})

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+SCHEMA = 5
+"""Of refine.json. A document of another one is not read."""
+
 
 def answer(document: Mapping[str, Any]) -> str:
     """The verdict with what was accepted, and, if the motion does not distinguish an effect from others, with these.

@@ -14,7 +14,7 @@ from masiv.inference.predictive import Forecast
 from masiv.models.base import EffectTerm
 from masiv.models.free_body import GRID_CORRECTION
 from masiv.observations.base import Observation, rms_mm
-from masiv.refinement.answer import answer
+from masiv.refinement.answer import SCHEMA, answer
 from masiv.refinement.candidates import Candidate
 from masiv.refinement.discrepancy import DISCREPANCY_FORCE
 from masiv.refinement.discrepancy_field import peak, sampled_fields, share
@@ -24,7 +24,6 @@ from masiv.refinement.rounds import Round, Trial, alternatives
 from masiv.refinement.support import carried_weight, carried_weight_stderr
 from masiv.refinement.world_vectors import vectors_in_world
 
-SCHEMA = 5
 WORST_POINTS = 0.1
 """Part of the points whose middle is the place where a residual is largest."""
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from masiv.errors import InputError
 from masiv.files import read_npz
-from masiv.refinement.answer import answer, outcome, words
+from masiv.refinement.answer import SCHEMA, answer, outcome, words
 from masiv.refinement.support import question
 from masiv.report import plots
 from masiv.report.force_plot import force_in_space
@@ -47,7 +47,7 @@ def read_refined(run: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]] | No
         fields |= {name: file[f"{name}@{first}"] for name in FORCE if f"{name}@{first}" in file}
     except (InputError, KeyError, IndexError) as error:
         raise InputError(f"{run / REFINED} and {FIELDS} cannot be read ({error}): run masiv refine again") from error
-    if not isinstance(document, dict) or document.get("schema") != 4:
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
         raise InputError(f"{run / REFINED} is of another version of masiv: run masiv refine again")
     return document, fields
 
