@@ -13,6 +13,7 @@ from masiv.inference.error_covariance import ErrorBlock, matern52
 from masiv.inference.error_model import ErrorModel
 from masiv.inference.evidence import Evidence
 from masiv.inference.marginal_likelihood import ParameterPriors, SizePriors, marginal, marginal_with_unknown
+from masiv.inference.model_fit import evaluate_fit
 from masiv.inference.predictive import forecast
 from masiv.inference.segments import effective_instants, independent_series
 from masiv.refinement.hypotheses import linearized, weighed
@@ -197,3 +198,14 @@ def test_a_fit_at_the_mean_of_its_posterior_stays_there():
     (hypothesis,) = weighed(model, [(again, linearized(model, again))])
     assert hypothesis.distance_from_mean <= CLOSE
     assert posterior_fit(model, again, 1.0).values == again.values
+
+
+def test_standard_errors_hold_how_far_a_fit_is_from_the_mean_of_its_posterior():
+    model = LinearModel({"velocity_z": 0.3})
+    at_mean = posterior_fit(model, baseline(model), 1.0)
+    moved = {"velocity_z": at_mean.values["velocity_z"] + 0.05}
+    off = evaluate_fit(model, at_mean.model, at_mean.parameters, moved, at_mean.jacobian, robust_scale=1.0)
+    (hypothesis,) = weighed(model, [(off, linearized(model, off))])
+    assert hypothesis.with_posterior().stderr["velocity_z"] == pytest.approx(
+        np.hypot(0.05, at_mean.stderr["velocity_z"]), rel=0.01
+    )

@@ -61,9 +61,10 @@ class Hypothesis:
         return {**values, **moved}
 
     def with_posterior(self) -> ModelFit:
-        """The fit with the standard errors of the posterior, errors of law, initial state and noise included."""
+        """The fit with the root mean square distances of the posterior from its values as standard errors: errors of
+        law, initial state and noise, and of a fit that is not at the mean of the posterior."""
         names = [p.name for p in self.linear.parameters]
-        spread = np.sqrt(np.diag(self.marginal.covariance))[: len(names)]
+        spread = np.sqrt(np.diag(self.marginal.covariance) + self.marginal.mean**2)[: len(names)]
         errors = {
             p.name: float(s) * (abs(self.fitted.values[p.name]) if p.log else 1.0)
             for p, s in zip(self.linear.parameters, spread, strict=True)
