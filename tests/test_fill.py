@@ -9,6 +9,7 @@ from still import still
 from masiv.continuum.config import TrajectoryConfig
 from masiv.continuum.fill import DensityField, density_field, depth_in_front, even_points, fill_volume
 from masiv.errors import MasivError
+from masiv.hull.volume import VolumePrior
 
 CENTRE, RADIUS = np.array([0.05, 0.45, 0.0]), 0.25
 CONFIG = TrajectoryConfig(particle_count=1500, fill_resolution=40)
@@ -71,6 +72,19 @@ def test_too_few_particles_for_a_thin_body_is_an_error():
     scene = spheres_scene(lambda frame: [(CENTRE, 0.05)])
     with pytest.raises(MasivError, match="particle_count"):
         fill_volume(scene, None, 0, CONFIG, spacing=0.5)
+
+
+def test_a_body_that_spread_to_a_thin_layer_is_filled():
+    """A disc of 0.56 m, 35 mm thick, is one coarse voxel thick, which the mean filter removes."""
+    along = np.arange(-0.255, 0.26, 0.03)
+    centres = np.stack(np.meshgrid(along, [0.4], along), -1).reshape(-1, 3)
+    disc = centres[np.hypot(centres[:, 0], centres[:, 2]) < 0.27]
+    scene = spheres_scene(lambda frame: [(centre, 0.0175) for centre in disc], cameras=ring(16, size=160))
+    config = CONFIG.model_copy(update={"fill_resolution": 16})
+    volume = np.pi * 0.28**2 * 0.035
+    assert density_field(scene, None, 0, config).volume < 0.5 * volume
+    field = density_field(scene, None, 0, config, prior=VolumePrior(volume, 0.2))
+    assert 0.8 * volume < field.volume < 1.5 * volume
 
 
 def test_rendered_surface_carves_what_silhouettes_cannot_see(taichi):

@@ -33,6 +33,8 @@ _SMALLEST_PIECE = 0.1
 """Connected pieces smaller than this fraction of the largest one are noise of the masks."""
 _TOLERANCE_GROWTH = 1.25
 """Factor of one step in the search for a tolerance of depth that leaves a probable volume."""
+_FINER = (1, 2, 4)
+"""Voxels along the longest side that are tried, in ``fill_resolution``: a fluid spreads to a layer of a few voxels."""
 
 
 @dataclass(frozen=True)
@@ -112,14 +114,36 @@ def density_field(
     volume [m³]: of the object's hull at frame 0, if known; see ``remove_shadow_volume``. prior: of the object's volume.
     mirror: plane of symmetry of the object at this frame, if it is known.
     The depth of a surface that was fitted to noisy pictures is biased. If so much is carved that the volume is
-    improbable (``VolumePrior.lower``), the depth counts less: its tolerance grows until the volume is not.
+    improbable (``VolumePrior.lower``), the depth counts less: its tolerance grows until the volume is not. A layer of
+    two voxels does not survive the filter: if the silhouettes alone leave an improbable volume, voxels are finer.
     """
     if scene.load_cloud is not None:
         return cloud_volume(
             scene.cloud(frame), config.fill_resolution, scene.ground, f"the cloud of frame {frame} of {scene.path}"
         )
-    views = silhouettes(scene, frame, config.fill_resolution)
-    hull = visual_hull(scene, frame, resolution=config.fill_resolution, views=views)
+    probable = 0.0 if prior is None else prior.lower
+    for resolution in (config.fill_resolution * k for k in _FINER):
+        field, hull = _carved(scene, dynamic, frame, config, resolution, volume, prior, mirror)
+        if hull.volume > probable:
+            break
+    if field.volume == 0:
+        raise MasivError(f"frame {frame} of {scene.path}: nothing is left of the object behind its rendered surface")
+    return field
+
+
+def _carved(
+    scene: Scene,
+    dynamic: DynamicGaussians | None,
+    frame: int,
+    config: TrajectoryConfig,
+    resolution: int,
+    volume: float | None,
+    prior: VolumePrior | None,
+    mirror: MirrorPlane | None,
+) -> tuple[DensityField, DensityField]:
+    """``density_field`` with ``resolution`` voxels along the longest side, and that of the silhouettes alone."""
+    views = silhouettes(scene, frame, resolution)
+    hull = visual_hull(scene, frame, resolution=resolution, views=views)
     if volume is not None:
         hull = remove_shadow_volume(scene, frame, hull, volume, views)
     if mirror is not None:
@@ -143,18 +167,16 @@ def density_field(
         density[solid & ~_main_pieces(solid)] = 0.0
         return DensityField(density, lower, spacing)
 
+    whole = smoothed(None)
     if dynamic is None:
-        field = smoothed(None)
-    else:
-        excess = depth_in_front(dynamic, [view.camera for view in views], frame / scene.fps, hull.points)
-        tolerance = config.depth_tolerance * spacing
+        return whole, whole
+    excess = depth_in_front(dynamic, [view.camera for view in views], frame / scene.fps, hull.points)
+    tolerance = config.depth_tolerance * spacing
+    field = smoothed(excess > tolerance)
+    while prior is not None and field.volume < prior.lower and (excess > tolerance).any():
+        tolerance *= _TOLERANCE_GROWTH
         field = smoothed(excess > tolerance)
-        while prior is not None and field.volume < prior.lower and (excess > tolerance).any():
-            tolerance *= _TOLERANCE_GROWTH
-            field = smoothed(excess > tolerance)
-    if field.volume == 0:
-        raise MasivError(f"frame {frame} of {scene.path}: nothing is left of the object behind its rendered surface")
-    return field
+    return field, whole
 
 
 def _outside_of_masks(views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float) -> np.ndarray:
