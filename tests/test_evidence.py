@@ -175,3 +175,15 @@ def test_nothing_is_named_without_an_effect_and_intervals_cover_with_one():
     z = np.array([(mean - s) / sd for s, mean, sd in found])
     assert 30 <= (np.abs(z) < 1).sum() <= 54  # 41 expected
     assert (np.abs(z) < 2).sum() >= 51  # 57 expected
+
+
+def test_what_grids_differ_by_along_a_parameter_adds_its_variance_and_no_evidence():
+    """Two grids that differ like a parameter by +a and -a: one more lies sqrt(3) a from their mean, whatever the
+    noise is."""
+    b = drawn(np.random.default_rng(3), 5.0)
+    priors = ParameterPriors(np.zeros(3), np.full((1, 3), 1e-9))
+    without = marginal([b], priors, SizePriors.of([b]))
+    shift = 0.7 * b.jacobian[..., 2]
+    found = marginal([replace(b, grids=np.stack([shift, -shift]))], priors, SizePriors.of([b]))
+    np.testing.assert_allclose(found.covariance - without.covariance, np.diag([0, 0, 3 * 0.7**2]), atol=1e-4)
+    assert found.log_evidence == without.log_evidence

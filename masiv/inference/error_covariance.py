@@ -30,7 +30,8 @@ class ErrorBlock:
     mode group. jitter [m]: expected jitter of a coefficient; smooth (T,) [m]: expected size of smooth errors of a
     coefficient; grid (T,) [m]: what another grid would change in it, zero if there is none. grid_length [s]. weight:
     power of the block's likelihood, below 1 if its modes are not independent of each other. motion: size of the motion
-    over that of smooth errors, which errors cannot exceed.
+    over that of smooth errors, which errors cannot exceed. grids (S, T, K) [m]: by how much each of S grids differs
+    from their mean; not given if there are none.
     """
 
     residual: np.ndarray
@@ -43,6 +44,7 @@ class ErrorBlock:
     grid_length: float
     weight: float = 1.0
     motion: float = 1e3
+    grids: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,9 @@ class ParameterPriors:
 @dataclass(frozen=True)
 class Marginal:
     """log_evidence: logarithm of the marginal likelihood. mean, covariance: of the parameters less their fitted values,
-    (P,) and (P, P), over the mixture. logs (3 G + 1,): logarithms of the sizes of the errors (``ErrorSizes``). unknown:
-    posterior probability that something unknown acts as well."""
+    (P,) and (P, P), over the mixture; what one more grid would change in the mean is in the covariance. logs (3 G +
+    1,): logarithms of the sizes of the errors (``ErrorSizes``). unknown: posterior probability that something unknown
+    acts as well."""
 
     log_evidence: float
     mean: np.ndarray
@@ -154,6 +155,26 @@ class _Likelihood:
             out += block.gradient(logs, -block.block.weight * (0.5 * data.shape[1] * inverse + spread))
         return replace(terms, gradient=out)
 
+    def by_another_grid(self, logs: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """Covariance (P, P) of the mean of parameters with ``covariance`` (P, P), if one more grid differs from the
+        mean of the S grids as they do: its error moves all modes together, which the covariance of errors does not
+        know."""
+        moved = []
+        for known, data in zip(self.covariances, self.data, strict=True):
+            grids = known.block.grids
+            if grids is None or len(grids) < 2:
+                continue
+            factor = cholesky(known(logs), lower=True, check_finite=False)
+            solved = cho_solve((factor, True), np.moveaxis(grids, 0, -1).reshape(len(factor), -1), check_finite=False)
+            rows = data.shape[0] * data.shape[1]
+            derivatives = data[..., 1:].reshape(rows, len(covariance))
+            moved.append(known.block.weight * (derivatives.T @ solved.reshape(rows, len(grids))))
+        if not moved:
+            return np.zeros_like(covariance)
+        shifts = covariance @ np.sum(moved, axis=0)
+        count = shifts.shape[1]
+        return shifts @ shifts.T * (count + 1) / (count * (count - 1))
+
     def _components(self, gram: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """log p but for a constant (S,), mean (S, P) about the prior mean and covariance (S, P, P) of each component,
         and the gradient (S, 1 + P, 1 + P) of log p by ``gram``."""
@@ -230,6 +251,7 @@ def marginal(
     terms = likelihood.terms(logs)
     weights = np.exp(terms.logp - np.logaddexp.reduce(terms.logp))
     mean, spread = _moments(weights, terms.mean, terms.covariance)
+    spread = spread + likelihood.by_another_grid(logs, np.tensordot(weights, terms.covariance, 1))
     return Marginal(-float(found.fun) + float(volume), priors.mean + mean, spread, logs)
 
 

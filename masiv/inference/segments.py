@@ -37,7 +37,8 @@ class Segment:
     kept: instants (T,), of which the first ``decided`` take part in decisions and the rest is for the test; what is
     expected is found from the former alone. turned: see ``MotionModes.coefficients``. jitter (G,) [m]: expected jitter
     of a coefficient; smooth (T,) [m]: expected smooth error of a point along an axis; grid: of each group, (T,) [m] by
-    which another grid may change a coefficient; weights (G,): powers of the likelihood of each group; first_group:
+    which another grid may change a coefficient; grids: of each group, (S, T, K_g) [m] by which those that were tried
+    differ from their mean; weights (G,): powers of the likelihood of each group; first_group:
     number of groups of other kinds of segments.
     """
 
@@ -50,6 +51,7 @@ class Segment:
     jitter: tuple[float, ...]
     smooth: np.ndarray
     grid: tuple[np.ndarray, ...]
+    grids: tuple[np.ndarray, ...]
     weights: tuple[float, ...]
     first_group: int
 
@@ -68,7 +70,8 @@ class Segment:
         if axes == 3 and count >= MIN_TURNED_POINTS:
             positions = np.where(np.isfinite(observation.values), observation.values, observation.points)
             turned = rotations_since_start(observation.points, positions[kept].astype(np.float64))
-        grid = _grid_changes(observation, modes, kept, turned)
+        grids = _grid_changes(observation, modes, kept, turned)
+        grid = tuple(map(_one_more, grids))
         known = observation.observation_std[kept] / math.sqrt(axes)
         floor = float(known.min()) / math.sqrt(count)
         known_turn = None if turned is None else turned[:decided]
@@ -86,7 +89,8 @@ class Segment:
             out.append(
                 cls(
                     index, observation, modes, kept[part], count, own, jitter, smooth[part],
-                    tuple(g[part] for g in grid), _weights(parts, together=late), len(modes.names) if late else 0,
+                    tuple(g[part] for g in grid), tuple(g[:, part] for g in grids), _weights(parts, together=late),
+                    len(modes.names) if late else 0,
                 )
             )  # fmt: skip
         return out
@@ -107,6 +111,7 @@ class Segment:
                 residual, derivatives, lags, self.first_group + group, self.jitter[group],
                 self.smooth[part] * math.sqrt(self.modes.axes / (residual.shape[1] * groups)), self.grid[group][part],
                 GRID_CORRELATION * float(self.observation.times[-1]), self.weights[group], motion,
+                self.grids[group][:, part],
             )
             for group, (residual, derivatives) in enumerate(zip(residuals, jacobians, strict=True))
         ]  # fmt: skip
@@ -172,14 +177,18 @@ def jitter_of(residual: np.ndarray) -> float:
 def _grid_changes(
     observation: Observation, modes: MotionModes, kept: np.ndarray, turned: np.ndarray | None
 ) -> tuple[np.ndarray, ...]:
-    """By how much one more grid may differ from the mean of those that were tried, beyond it; it does not fall as time
-    goes on."""
+    """Coefficients (S, T, K_g) [m] of each group of what S grids change beyond their mean."""
     if not observation.grid_corrections:
-        return tuple(np.zeros(len(kept)) for _ in modes.names)
-    count = len(observation.grid_corrections)
+        return tuple(np.zeros((0, len(kept), basis.shape[1])) for basis in modes.bases)
     apart = [modes.coefficients((c - observation.grid_correction)[kept], turned) for c in observation.grid_corrections]
+    return tuple(map(np.stack, zip(*apart, strict=True)))
+
+
+def _one_more(grids: np.ndarray) -> np.ndarray:
+    """By how much (T,) one more grid may differ from the mean of those that were tried (S, T, K), beyond it; it does
+    not fall as time goes on."""
+    count = len(grids)
+    if count == 0:
+        return np.zeros(grids.shape[1])
     more = math.sqrt((count + 1) / (count - 1))
-    return tuple(
-        more * np.maximum.accumulate(np.sqrt(np.mean([(c[g] ** 2).mean(1) for c in apart], axis=0)))
-        for g in range(len(modes.names))
-    )
+    return more * np.maximum.accumulate(np.sqrt((grids**2).mean(2).mean(0)))

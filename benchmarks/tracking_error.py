@@ -1,0 +1,162 @@
+"""How large are the errors of points that are followed in pictures? Synthetic scenes of random bodies, whose motion is
+known.
+
+    python benchmarks/tracking_error.py draw OUT --count 8
+    masiv reconstruct OUT/NUMBER/scene --out OUT/NUMBER/run --preset quick
+    masiv trajectory OUT/NUMBER/run --preset quick
+    python benchmarks/tracking_error.py measure OUT
+
+``measure`` prints, for each group of modes of motion, the factor on the size that refine expects of smooth errors,
+before the body has touched anything and after: the posterior mode under a prior that says next to nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+TOLD = 3.0
+"""Standard deviation of the logarithm of the factors beforehand."""
+
+
+def spec(seed: int):
+    """A body of random shape, size, law and motion, 11 cameras."""
+    from masiv.shapes import ShapeSpec
+    from masiv.synth.spec import CameraSpec, MaterialSpec, SynthSpec
+
+    rng = np.random.default_rng([seed, 20261129])
+    law, parameters = _law(rng)
+    velocity = rng.normal(0, 0.8, 3) * (1, 0.5, 1)
+    frames, fps = 16, 24.0
+    reach = -0.5 * velocity * frames / fps
+    size = rng.uniform(0.3, 0.6)
+    return SynthSpec(
+        shape=ShapeSpec(
+            kind=rng.choice(["cube", "sphere", "capsule", "cylinder", "torus", "cross"]), size=size,
+            rotation_deg=tuple(rng.uniform(-180, 180, 3)), position=(reach[0], reach[2]),
+            clearance=rng.uniform(0.1, 0.4),
+        ),
+        material=MaterialSpec(law=law, parameters=parameters),
+        velocity=tuple(velocity), omega=tuple(rng.normal(0, 3, 3)),
+        contact=rng.choice(["sticky", "slip"]), friction=rng.uniform(0.1, 0.6),
+        texture=rng.choice(["noise", "stripes", "patches"]), image_noise=rng.uniform(0.5, 3),
+        cameras=CameraSpec(size=160, target=(0, 0.35, 0)), frames=frames, fps=fps, seed=seed,
+    )  # fmt: skip
+
+
+def _law(rng: np.random.Generator) -> tuple[str, dict[str, float]]:
+    def between(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    kind = rng.choice(["neo_hookean", "von_mises", "newtonian", "drucker_prager"], p=[0.4, 0.25, 0.2, 0.15])
+    if kind == "newtonian":
+        return kind, {"viscosity": between(5, 200), "bulk_modulus": between(5e4, 3e5)}
+    ratio = float(rng.uniform(0.2, 0.4))
+    if kind == "neo_hookean":
+        return kind, {"youngs_modulus": between(1e4, 3e5), "poissons_ratio": ratio}
+    if kind == "von_mises":
+        return kind, {"youngs_modulus": between(5e4, 5e5), "poissons_ratio": ratio, "yield_stress": between(1e3, 1e4)}
+    return kind, {
+        "youngs_modulus": between(1e5, 5e5), "poissons_ratio": ratio, "friction_angle": float(rng.uniform(20, 45)),
+    }  # fmt: skip
+
+
+def draw(out: Path, count: int, first: int) -> None:
+    from masiv import runtime
+    from masiv.synth.synthesise import synthesise
+
+    runtime.start("cpu")
+    for seed in range(first, first + count):
+        if not (out / str(seed) / "scene").exists():
+            (out / str(seed)).mkdir(parents=True, exist_ok=True)
+            synthesise(spec(seed), out / str(seed) / "scene")
+            print(f"{seed}: {spec(seed).material.law} {spec(seed).shape.kind} {spec(seed).texture}", flush=True)
+
+
+def errors_of(run: Path, scene: Path):
+    """times (T,) [s], positions (T, N, 3) [m] of followed particles at the frames, and their errors (T, N, 3) [m]."""
+    from scipy.spatial import cKDTree
+
+    from masiv.continuum.trajectory import Trajectory
+    from masiv.subsample import kd_tree_subset
+
+    trajectory = Trajectory.load(run / "trajectory.npz")
+    seen = trajectory.positions[:, kd_tree_subset(trajectory.positions[0], 1500)].astype(np.float64)
+    at = np.stack([np.load(scene / "gt" / f"particles_{k}.npy") for k in range(len(seen))]).astype(np.float64)
+    distance, index = cKDTree(at[0]).query(seen[0], k=8)
+    weight = 1 / (distance + 1e-6)
+    weight /= weight.sum(1, keepdims=True)
+    expected = np.einsum("qk,tqkd->tqd", weight, (at - at[0])[:, index])
+    return trajectory.times, seen, seen - seen[0] - expected
+
+
+def sizes_of(run: Path, scene: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """names: of G groups of modes. Factors (2 G,) on the expected size of smooth errors that are most probable, in
+    flight and from the first contact on; what a group adds to the error after contact [mm] (G,)."""
+    from dataclasses import replace
+
+    from masiv.inference.marginal_likelihood import ParameterPriors, SizePriors, marginal
+    from masiv.inference.segments import Segment
+    from masiv.observations.base import Observation
+    from masiv.observations.noise_floor import noise_floor
+    from masiv.refinement.config import RefineConfig
+    from masiv.rigid import beyond_rigid, first_contact_frame
+
+    times, seen, error = errors_of(run, scene)
+    noise = noise_floor(seen, first_contact_frame(beyond_rigid(seen)))
+    lost = RefineConfig().tracking_error * beyond_rigid(seen)
+    # Corrections of no size: instants after the first contact are a segment of their own, as in refine.
+    none = np.zeros(seen[1:].shape)
+    observation = Observation(
+        name="", times=times[1:], points=seen[0], values=seen[1:], fit_count=len(times) - 1, noise_std=noise,
+        residual_std=np.hypot(noise, np.maximum.accumulate(lost)), grid_corrections=(none, none),
+    )  # fmt: skip
+    segments = Segment.of(0, observation, error[1:])
+    field = np.zeros((*error[1:].shape, 0))
+    blocks = [b for s in segments for b in s.blocks(error[1:], field)]
+    told = SizePriors.of(blocks)
+    count = len(told.mean) // 3
+    wide = replace(told, sd=np.where(np.arange(len(told.sd)) < 2 * count, TOLD, told.sd))
+    found = marginal(blocks, ParameterPriors(np.zeros(0), np.zeros((1, 0))), wide)
+    names = list(segments[0].modes.names)
+    late = [b for b in blocks if b.group >= len(names)] or blocks
+    added = np.array([1e3 * np.sqrt((b.residual**2).sum(1).mean()) for b in late])
+    factors = np.full(2 * len(names), np.nan)
+    factors[:count] = found.sizes.smooth
+    for g in set(range(count)) - {b.group for b in blocks}:
+        factors[g] = np.nan
+    return names, factors, added
+
+
+def measure(out: Path) -> None:
+    rows = []
+    followed = (f for f in out.iterdir() if (f / "run" / "trajectory.npz").is_file())
+    for folder in sorted(followed, key=lambda f: int(f.name)):
+        names, factors, added = sizes_of(folder / "run", folder / "scene")
+        rows.append(np.log(factors))
+        flight, contact = np.split(factors, 2)
+        print(folder.name, "flight", np.round(flight, 2), "contact", np.round(contact, 2), "[mm]", np.round(added, 1))
+    logs = np.array(rows)
+    for regime, part in zip(("flight", "contact"), np.split(logs, 2, axis=1), strict=True):
+        for name, values in zip(names, part.T, strict=True):
+            print(f"{regime} {name}: factor {np.exp(np.nanmean(values)):.2f}, sd of its logarithm "
+                  f"{np.nanstd(values, ddof=1):.2f}, {np.isfinite(values).sum()} scenes")  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["draw", "measure"])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--count", type=int, default=8)
+    parser.add_argument("--first", type=int, default=0)
+    given = parser.parse_args()
+    if given.what == "draw":
+        draw(given.out, given.count, given.first)
+    else:
+        measure(given.out)
+
+
+if __name__ == "__main__":
+    main()
