@@ -15,6 +15,7 @@ from masiv.continuum.finetune import KnownMotion, fine_tune
 from masiv.continuum.trajectory import Trajectory, positions_at
 from masiv.errors import InputError, MasivError
 from masiv.hull.velocity import with_velocities
+from masiv.hull.volume import VolumePrior
 from masiv.progress import Progress, silent
 from masiv.scene.scene import Scene
 from masiv.splat.deformation import DeformationNetwork
@@ -51,10 +52,13 @@ def extend_trajectory(
     scene = with_velocities(scene, dynamic.base_positions(scene.times))
     start = FilledVolume(trajectory.positions[0].astype(np.float64), trajectory.spacing, trajectory.volume)
     hull = hull_volume(scene, config)
+    same = None
+    if math.isfinite(trajectory.volume_log_sd):
+        same = VolumePrior(trajectory.volume, trajectory.volume_log_sd)
     volumes = []
     for frame in range(known, scene.frame_count):
         progress("fill new frames", frame - known + 1, scene.frame_count - known)
-        volumes.append(fill_later_frame(scene, dynamic, frame, config, start, hull))
+        volumes.append(fill_later_frame(scene, dynamic, frame, config, start, hull, same))
     known_motion = KnownMotion(
         torch.from_numpy(trajectory.positions - trajectory.positions[0]),
         _initial_network(motion, dynamic.canonical.means.detach(), trajectory, seed),
