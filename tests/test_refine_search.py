@@ -383,3 +383,20 @@ def test_what_was_accepted_first_is_exchanged_once_the_others_are_known():
     assert result.after.values["linear_drag.strength"] == pytest.approx(0.5, abs=0.02)
     written = document(result)
     assert "exchanged quadratic drag for linear drag" in text(written)
+
+
+class Saturating(LinearModel):
+    """A strength s acts as s / (1 + |s| / 2): at zero it seems to do more than it does."""
+
+    def motion(self, values):
+        return super().motion({n: v / (1 + abs(v) / 2) if "strength" in n else v for n, v in values.items()})
+
+
+def test_the_limit_of_an_effect_that_may_act_is_not_below_what_its_own_fit_says():
+    model = Saturating({"body_force.strength": 0.05}, effects={"body_force": EFFECTS["body_force"]})
+    truth = Saturating({"body_force.strength": 4.0}, effects={"body_force": EFFECTS["body_force"]})
+    model.observations = truth.observations
+    result = refined(model, {"max_null_probability": 1e-300})
+    assert not result.search.after.model.effects  # no evidence is enough
+    (limit,) = result.search.limits
+    assert 3.0 < limit.strength < 4.5  # by the derivative at zero, 4 / (1 + 4 / 2)

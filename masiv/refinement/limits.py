@@ -13,6 +13,7 @@ from masiv.inference.linear_model import LinearModel, linear_model
 from masiv.inference.marginal_likelihood import Marginal
 from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.effect_fit import absent
+from masiv.refinement.hypotheses import Hypothesis
 
 LEVEL = 0.95
 """Probability that a strength is below its limit."""
@@ -70,9 +71,10 @@ def extended(at: LinearModel, term: EffectTerm, values: dict[str, float], column
 
 def upper_limit(
     evidence: Evidence, at: LinearModel, terms: Sequence[EffectTerm], term: EffectTerm, here: Marginal,
-    found: tuple[dict[str, float], LinearModel],
+    found: tuple[dict[str, float], LinearModel], least: float = 0.0,
 ) -> UpperLimit:  # fmt: skip
-    """The limit of ``term`` in addition to the model ``at``, with the effects ``terms`` and the evidence ``here``."""
+    """The limit of ``term`` in addition to the model ``at``, with the effects ``terms`` and the evidence ``here``; not
+    below ``least``."""
     columns = found[1]
     joined = extended(at, term, *found)
     whole = evidence.marginal(joined, [*terms, term], near=here)
@@ -94,5 +96,18 @@ def upper_limit(
     squares = np.einsum("di,ij,dj->d", draws, gram, draws)
     count = sum(f.shape[0] * f.shape[1] for f in columns.fields)
     motion = math.sqrt(float(np.quantile(squares, LEVEL)) / count)
+    if size < least:
+        size, motion = least, motion * least / size
     middle = math.sqrt(sum(float(np.median(strength_scales(p))) ** 2 for k in seen for p in [term.strengths[k]]))
     return UpperLimit(term.name, size, 1e3 * motion, size < middle, whole.log_evidence - here.log_evidence)
+
+
+def limit_of_fit(hypothesis: Hypothesis, term: EffectTerm) -> float:
+    """95 % quantile of the size of the strength of ``term`` in the posterior of a model that was fitted with it: the
+    linear model of ``upper_limit`` holds near zero alone."""
+    names = [p.name for p in hypothesis.linear.parameters]
+    index = [names.index(p.name) for p in term.strengths]
+    values = [p.fitted(hypothesis.fitted.values[p.name]) for p in term.strengths]
+    mean, covariance = hypothesis.marginal.mean[index] + values, hypothesis.marginal.covariance[np.ix_(index, index)]
+    draws = np.random.default_rng(0).multivariate_normal(mean, covariance, DRAWS, method="eigh")
+    return float(np.quantile(np.linalg.norm(draws, axis=1), LEVEL))

@@ -12,12 +12,12 @@ from masiv.inference.evidence import Evidence
 from masiv.inference.model_fit import ModelFit, rank_by_bic, refit_whitened
 from masiv.inference.predictive import forecast, predictive_p
 from masiv.inference.robust import robust_scale_of
-from masiv.models.base import ForwardModel
+from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.discrepancy import discrepancy_force
 from masiv.refinement.effect_fit import BROYDEN_STEPS
 from masiv.refinement.exchange import with_exchanges
 from masiv.refinement.hypotheses import log_prior
-from masiv.refinement.limits import UpperLimit, sensitivity, upper_limit
+from masiv.refinement.limits import UpperLimit, limit_of_fit, sensitivity, upper_limit
 from masiv.refinement.posterior_fit import posterior_fit
 from masiv.refinement.rounds import Check, Round, SearchResult
 from masiv.refinement.search_round import run_round
@@ -216,7 +216,8 @@ def _check(state: SearchState, fitted: ModelFit, settings: SearchSettings) -> Ch
 
 
 def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchSettings) -> list[UpperLimit]:
-    """Of all effects that could act in addition to ``state.fit``, at the places where the first ranking saw them."""
+    """Of all effects that could act in addition to ``state.fit``, at the places where the first ranking saw them; of
+    those in the last credible set, not below what their own fits allow."""
     model, fitted = state.forward_model, state.fit
     names = settings.considered(model, fitted.model)
     places = _places(rounds[0]) if rounds else {}
@@ -235,5 +236,16 @@ def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchS
         if isinstance(found, TaskError):
             out.append(UpperLimit.unknown(name, found.reason))
         else:
-            out.append(upper_limit(evidence, line, terms, model.term(name), here, found))
+            least = _allowed(model.term(name), fitted, rounds)
+            out.append(upper_limit(evidence, line, terms, model.term(name), here, found, least))
     return out
+
+
+def _allowed(term: EffectTerm, fitted: ModelFit, rounds: Sequence[Round]) -> float:
+    """How strong ``term`` may be in addition to ``fitted`` by the fits of the last credible set; 0 if it is in none."""
+    posterior = rounds[-1].posterior if rounds else None
+    if posterior is None:
+        return 0.0
+    wanted = frozenset((*fitted.model.effects, term.name))
+    own = [h for h in posterior.hypotheses if h.effects == wanted and wanted in posterior.credible_set()]
+    return max((limit_of_fit(h, term) for h in own), default=0.0)
