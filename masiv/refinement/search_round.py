@@ -32,6 +32,9 @@ from masiv.refinement.tasks import map_tasks
 from masiv.refinement.trials import Attempts, converged, try_effects
 from masiv.workers import TaskError
 
+OPEN_QUESTIONS = 3
+"""Effects of a round that are fitted to the end without being named."""
+
 
 def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSettings) -> Round:
     """Add one effect to ``state.fit``. bases: fits without that effect to start from, the first to be ranked in
@@ -84,8 +87,44 @@ def _judged(
     state: SearchState, bases: Sequence[ModelFit], trials: Sequence[Trial], attempts: Attempts,
     settings: SearchSettings,
 ) -> Round:  # fmt: skip
-    """The round with the posterior over the models without (``bases``) and with one effect more (``trials``)."""
-    without = [state.fit, *bases[1:]]
+    """The round with the posterior over the models without (``bases``) and with one effect more (``trials``). What may
+    act is fitted to the end before the question is left open, as the models without it are."""
+    without, fewer = [state.fit, *bases[1:]], len(state.fit.model.effects)
+    posterior, trials = _posterior(state, without, trials, settings)
+    for _ in range(OPEN_QUESTIONS):
+        trial = _most_probable(posterior, trials, fewer)
+        if trial is None or trial.ended or _named(posterior, fewer, settings):
+            break
+        if frozenset(trial.fitted.model.effects) not in posterior.credible_set():
+            break
+        ended = [_completed(state, t, settings) if t is trial else t for t in trials]
+        posterior, trials = _posterior(state, without, ended, settings)
+    accepted = None
+    trial = _most_probable(posterior, trials, fewer)
+    if trial is not None and _named(posterior, fewer, settings):
+        final = trial if trial.ended else _completed(state, trial, settings)
+        trials = [final if t is trial else t for t in trials]
+        accepted = final if not final.impossible else None
+    current = posterior.best(fewer)
+    base = current.with_posterior() if current is not None else state.fit
+    return Round(base, attempts.ranking, tuple(trials), accepted, posterior, attempts.failures)
+
+
+def _named(posterior: Posterior, fewer: int, settings: SearchSettings) -> bool:
+    return posterior.with_at_most(fewer) < settings.config.max_null_probability
+
+
+def _most_probable(posterior: Posterior, trials: Sequence[Trial], fewer: int) -> Trial | None:
+    """With more than ``fewer`` effects."""
+    chosen = posterior.best(fewer + 1)
+    return None if chosen is None else next(t for t in trials if t.fitted is chosen.fitted)
+
+
+def _posterior(
+    state: SearchState, without: Sequence[ModelFit], trials: Sequence[Trial], settings: SearchSettings
+) -> tuple[Posterior, list[Trial]]:
+    """Over models ``without`` one effect more and those of ``trials`` that can act; the trials with their evidence,
+    most probable first."""
     possible = [t for t in trials if not t.impossible]
     hypotheses, failed = _weighed(state, without, [t.fitted for t in possible], settings)
     simpler = [h.marginal.log_evidence for h in hypotheses if len(h.effects) == len(state.fit.model.effects)]
@@ -98,18 +137,7 @@ def _judged(
     trials.sort(key=lambda t: -math.inf if t.log_bayes_factor is None else t.log_bayes_factor, reverse=True)
     causes = settings.causes(state.forward_model, state.fit.model)
     shapes = {name: len(cause) for cause in causes for name in cause}
-    posterior = Posterior.of(hypotheses, len(causes), shapes)
-    fewer = len(state.fit.model.effects)
-    chosen = posterior.best(fewer + 1)
-    accepted = None
-    if chosen is not None and posterior.with_at_most(fewer) < settings.config.max_null_probability:
-        trial = next(t for t in trials if t.fitted is chosen.fitted)
-        final = _completed(state, trial, settings)
-        trials = [final if t is trial else t for t in trials]
-        accepted = final if not final.impossible else None
-    current = posterior.best(fewer)
-    base = current.with_posterior() if current is not None else state.fit
-    return Round(base, attempts.ranking, tuple(trials), accepted, posterior, attempts.failures)
+    return Posterior.of(hypotheses, len(causes), shapes), trials
 
 
 def _weighed(
@@ -173,7 +201,7 @@ def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Tr
     hypotheses, failed = _weighed(state, [best], [], settings)
     if not hypotheses:
         return replace(trial, fitted=best, impossible=(f"at its best fit, {failed[id(best)]}",))
-    done = replace(trial, fitted=hypotheses[0].with_posterior())
+    done = replace(trial, fitted=hypotheses[0].with_posterior(), ended=True)
     return replace(done, impossible=tuple(reasons_against(model, done.fitted, done.effect)))
 
 
