@@ -397,6 +397,6 @@ def test_an_effect_that_may_act_is_fitted_to_the_end_and_its_limit_is_not_below_
     result = refined(model, {"max_null_probability": 1e-300})
     assert not result.search.after.model.effects  # no evidence is enough
     (trial,) = result.search.rounds[-1].trials
-    assert trial.fitted.values["body_force.strength"] == pytest.approx(4.0, rel=0.05)  # the derivative at zero leads to 2.1
+    assert trial.fitted.values["body_force.strength"] == pytest.approx(4.0, rel=0.05)
     (limit,) = result.search.limits
     assert limit.strength == pytest.approx(4.0, rel=0.05)  # by the derivative at zero, 4 / (1 + 4 / 2)

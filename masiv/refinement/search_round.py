@@ -32,8 +32,8 @@ from masiv.refinement.tasks import map_tasks
 from masiv.refinement.trials import Attempts, converged, try_effects
 from masiv.workers import TaskError
 
-OPEN_QUESTIONS = 3
-"""Effects of a round that are fitted to the end without being named."""
+MOST_ENDED = 3
+"""Effects of a round that are fitted to the end before they are judged."""
 
 
 def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSettings) -> Round:
@@ -88,14 +88,12 @@ def _judged(
     settings: SearchSettings,
 ) -> Round:  # fmt: skip
     """The round with the posterior over the models without (``bases``) and with one effect more (``trials``). What may
-    act is fitted to the end before the question is left open, as the models without it are."""
+    act is fitted to the end before it is judged, as the models without it are."""
     without, fewer = [state.fit, *bases[1:]], len(state.fit.model.effects)
     posterior, trials = _posterior(state, without, trials, settings)
-    for _ in range(OPEN_QUESTIONS):
-        trial = _most_probable(posterior, trials, fewer)
-        if trial is None or trial.ended or _named(posterior, fewer, settings):
-            break
-        if frozenset(trial.fitted.model.effects) not in posterior.credible_set():
+    for _ in range(MOST_ENDED):
+        trial = _to_be_ended(posterior, trials, fewer)
+        if trial is None:
             break
         ended = [_completed(state, t, settings) if t is trial else t for t in trials]
         posterior, trials = _posterior(state, without, ended, settings)
@@ -112,6 +110,18 @@ def _judged(
 
 def _named(posterior: Posterior, fewer: int, settings: SearchSettings) -> bool:
     return posterior.with_at_most(fewer) < settings.config.max_null_probability
+
+
+def _to_be_ended(posterior: Posterior, trials: Sequence[Trial], fewer: int) -> Trial | None:
+    """What is to be fitted to the end: the most probable effect if it may act, else that with the nearest fit, unless
+    its odds are negligible. Far from where a fit ends its evidence is wrong. None if both have ended."""
+    first = _most_probable(posterior, trials, fewer)
+    if first is not None and not first.ended and frozenset(first.fitted.model.effects) in posterior.credible_set():
+        return first
+    factors = {id(t): t.log_bayes_factor for t in trials if t.log_bayes_factor is not None and not t.impossible}
+    possible = [t for t in trials if factors.get(id(t), -math.inf) > max([0.0, *factors.values()]) - NEGLIGIBLE]
+    nearest = min(possible, key=lambda t: t.fitted.cost, default=None)
+    return None if nearest is None or nearest.ended else nearest
 
 
 def _most_probable(posterior: Posterior, trials: Sequence[Trial], fewer: int) -> Trial | None:
