@@ -209,3 +209,11 @@ def test_standard_errors_hold_how_far_a_fit_is_from_the_mean_of_its_posterior():
     assert hypothesis.with_posterior().stderr["velocity_z"] == pytest.approx(
         np.hypot(0.05, at_mean.stderr["velocity_z"]), rel=0.01
     )
+
+
+@pytest.mark.parametrize(("strength", "like_zero"), [(0.0, True), (0.3, False)])
+def test_a_strength_is_told_from_zero_by_its_own_posterior(strength, like_zero):
+    model = LinearModel({"velocity_z": 0.3, "viscosity.strength": strength})
+    fit = posterior_fit(model, baseline(model, ("viscosity",)), 1.0)
+    (hypothesis,) = weighed(model, [(fit, linearized(model, fit))])
+    assert hypothesis.like_zero(model.term("viscosity")) is like_zero

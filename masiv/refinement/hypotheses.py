@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
+from scipy.stats import chi2
 
 from masiv.inference.evidence import GRAVITY_EFFECT, Evidence
 from masiv.inference.linear_model import LinearModel, linear_model
 from masiv.inference.marginal_likelihood import Marginal
 from masiv.inference.model_fit import ModelFit
-from masiv.models.base import ForwardModel
+from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.tasks import map_tasks
 from masiv.workers import TaskError, Workers, unwrap
 
@@ -60,11 +61,27 @@ class Hypothesis:
         moved = {p.name: p.value(p.fitted(values[p.name]) + float(d)) for p, d in changes if p.name in values}
         return {**values, **moved}
 
-    def with_posterior(self) -> ModelFit:
-        """The fit with the root mean square distances of the posterior from its values as standard errors: errors of
-        law, initial state and noise, and of a fit that is not at the mean of the posterior."""
+    @property
+    def second_moment(self) -> np.ndarray:
+        """Of the posterior about the fitted values, (P, P): errors of law, initial state and noise, and of a fit that
+        is not at the mean of the posterior."""
+        return self.marginal.covariance + np.outer(self.marginal.mean, self.marginal.mean)
+
+    def like_zero(self, term: EffectTerm) -> bool:
+        """Whether the strengths of ``term`` are within the 95 % credible region about the fitted values that holds
+        zero. False for a term that takes the place of parameters: its absence is not zero."""
+        if term.replaces_parameter:
+            return False
         names = [p.name for p in self.linear.parameters]
-        spread = np.sqrt(np.diag(self.marginal.covariance) + self.marginal.mean**2)[: len(names)]
+        index = [names.index(p.name) for p in term.strengths]
+        values = np.array([self.fitted.values[p.name] for p in term.strengths])
+        squared = values @ np.linalg.solve(self.second_moment[np.ix_(index, index)], values)
+        return bool(squared < chi2.ppf(CREDIBLE, len(index)))
+
+    def with_posterior(self) -> ModelFit:
+        """The fit with the root mean square distances of the posterior from its values as standard errors."""
+        names = [p.name for p in self.linear.parameters]
+        spread = np.sqrt(np.diag(self.second_moment))[: len(names)]
         errors = {
             p.name: float(s) * (abs(self.fitted.values[p.name]) if p.log else 1.0)
             for p, s in zip(self.linear.parameters, spread, strict=True)
