@@ -213,9 +213,10 @@ def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Tr
         return replace(trial, fitted=best, impossible=(f"at its best fit, {failed[id(best)]}",))
     done = replace(trial, fitted=hypotheses[0].with_posterior(), ended=True)
     reasons = reasons_against(model, done.fitted, done.effect)
-    if hypotheses[0].like_zero(model.term(done.effect)):
+    like_zero = hypotheses[0].like_zero(model.term(done.effect))
+    if like_zero:
         reasons.append("its strength cannot be told from zero: another grid or start changes it by as much")
-    return replace(done, impossible=tuple(reasons))
+    return replace(done, impossible=tuple(reasons), like_zero=like_zero)
 
 
 def with_free_places(state: SearchState, fitted: ModelFit) -> ModelFit:
