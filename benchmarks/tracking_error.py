@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-TOLD = 3.0
-"""Standard deviation of the logarithm of the factors beforehand."""
+PRIOR_SD = 3.0
+"""Standard deviation of the logarithm of the factors in their prior."""
 
 
 def spec(seed: int):
@@ -77,19 +77,15 @@ def draw(out: Path, count: int, first: int) -> None:
 
 def errors_of(run: Path, scene: Path):
     """times (T,) [s], positions (T, N, 3) [m] of followed particles at the frames, and their errors (T, N, 3) [m]."""
-    from scipy.spatial import cKDTree
-
     from masiv.continuum.trajectory import Trajectory
+    from masiv.metrics import true_displacements
     from masiv.subsample import kd_tree_subset
 
     trajectory = Trajectory.load(run / "trajectory.npz")
     seen = trajectory.positions[:, kd_tree_subset(trajectory.positions[0], 1500)].astype(np.float64)
     at = np.stack([np.load(scene / "gt" / f"particles_{k}.npy") for k in range(len(seen))]).astype(np.float64)
-    distance, index = cKDTree(at[0]).query(seen[0], k=8)
-    weight = 1 / (distance + 1e-6)
-    weight /= weight.sum(1, keepdims=True)
-    expected = np.einsum("qk,tqkd->tqd", weight, (at - at[0])[:, index])
-    return trajectory.times, seen, seen - seen[0] - expected
+    true = np.stack(list(true_displacements(seen[0], at)))
+    return trajectory.times, seen, seen - seen[0] - true
 
 
 def sizes_of(run: Path, scene: Path) -> tuple[list[str], np.ndarray, np.ndarray]:
@@ -116,9 +112,9 @@ def sizes_of(run: Path, scene: Path) -> tuple[list[str], np.ndarray, np.ndarray]
     segments = Segment.of(0, observation, error[1:])
     field = np.zeros((*error[1:].shape, 0))
     blocks = [b for s in segments for b in s.blocks(error[1:], field)]
-    told = SizePriors.of(blocks)
-    count = len(told.mean) // 3
-    wide = replace(told, sd=np.where(np.arange(len(told.sd)) < 2 * count, TOLD, told.sd))
+    prior = SizePriors.of(blocks)
+    count = len(prior.mean) // 3
+    wide = replace(prior, sd=np.where(np.arange(len(prior.sd)) < 2 * count, PRIOR_SD, prior.sd))
     found = marginal(blocks, ParameterPriors(np.zeros(0), np.zeros((1, 0))), wide)
     names = list(segments[0].modes.names)
     late = [b for b in blocks if b.group >= len(names)] or blocks

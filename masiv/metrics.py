@@ -6,6 +6,8 @@ masks (H, W) in [0, 1].
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
@@ -57,15 +59,19 @@ def tracked_error_mm(
         )
     _finite(trajectory, "trajectory")
     _finite(truth, "truth")
+    pairs = zip(trajectory, true_displacements(rest_points, truth, neighbours), strict=True)
+    return np.array([1e3 * np.linalg.norm(moved - rest_points - true, axis=1).mean() for moved, true in pairs])
+
+
+def true_displacements(rest_points: np.ndarray, truth: np.ndarray, neighbours: int = 8) -> Iterator[np.ndarray]:
+    """Displacements (Q, 3) [m] of particles at ``rest_points`` (Q, 3) in each frame of ``truth`` (T, P, 3), see
+    ``tracked_error_mm``."""
     distance, index = cKDTree(truth[0]).query(rest_points, k=min(neighbours, truth.shape[1]))
     distance, index = distance.reshape(len(rest_points), -1), index.reshape(len(rest_points), -1)
     weight = 1.0 / (distance + 1e-6)
     weight /= weight.sum(axis=1, keepdims=True)
-    errors = []
-    for moved, true in zip(trajectory, truth, strict=True):
-        expected = np.einsum("qk,qkd->qd", weight, (true - truth[0]).astype(np.float64)[index])
-        errors.append(1e3 * np.linalg.norm(moved - rest_points - expected, axis=1).mean())
-    return np.array(errors)
+    for true in truth:
+        yield np.einsum("qk,qkd->qd", weight, (true - truth[0]).astype(np.float64)[index])
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:

@@ -115,7 +115,7 @@ def density_field(
     mirror: plane of symmetry of the object at this frame, if it is known.
     The depth of a surface that was fitted to noisy pictures is biased. If so much is carved that the volume is
     improbable (``VolumePrior.lower``), the depth counts less: its tolerance grows until the volume is not. A layer of
-    two voxels does not survive the filter: if the silhouettes alone leave an improbable volume, voxels are finer.
+    two voxels does not survive the filter: if it alone makes the volume improbable, voxels are finer.
     """
     if scene.load_cloud is not None:
         return cloud_volume(
@@ -123,8 +123,8 @@ def density_field(
         )
     probable = 0.0 if prior is None else prior.lower
     for resolution in (config.fill_resolution * k for k in _FINER):
-        field, hull = _carved(scene, dynamic, frame, config, resolution, volume, prior, mirror)
-        if hull.volume > probable:
+        field, filtered, unfiltered = _carved(scene, dynamic, frame, config, resolution, volume, prior, mirror)
+        if filtered > probable or unfiltered <= probable:  # enough is left, or it is not the filter that takes it
             break
     if field.volume == 0:
         raise MasivError(f"frame {frame} of {scene.path}: nothing is left of the object behind its rendered surface")
@@ -140,8 +140,9 @@ def _carved(
     volume: float | None,
     prior: VolumePrior | None,
     mirror: MirrorPlane | None,
-) -> tuple[DensityField, DensityField]:
-    """``density_field`` with ``resolution`` voxels along the longest side, and that of the silhouettes alone."""
+) -> tuple[DensityField, float, float]:
+    """``density_field`` with ``resolution`` voxels along the longest side; volume [m³] of the silhouettes alone, with
+    the filter and without it."""
     views = silhouettes(scene, frame, resolution)
     hull = visual_hull(scene, frame, resolution=resolution, views=views)
     if volume is not None:
@@ -168,15 +169,16 @@ def _carved(
         return DensityField(density, lower, spacing)
 
     whole = smoothed(None)
+    volumes = whole.volume, float(filled.sum()) * spacing**3
     if dynamic is None:
-        return whole, whole
+        return whole, *volumes
     excess = depth_in_front(dynamic, [view.camera for view in views], frame / scene.fps, hull.points)
     tolerance = config.depth_tolerance * spacing
     field = smoothed(excess > tolerance)
     while prior is not None and field.volume < prior.lower and (excess > tolerance).any():
         tolerance *= _TOLERANCE_GROWTH
         field = smoothed(excess > tolerance)
-    return field, whole
+    return field, *volumes
 
 
 def _outside_of_masks(views: tuple[Silhouette, ...], points: np.ndarray, tolerance: float) -> np.ndarray:

@@ -67,7 +67,7 @@ class Hypothesis:
         is not at the mean of the posterior."""
         return self.marginal.covariance + np.outer(self.marginal.mean, self.marginal.mean)
 
-    def like_zero(self, term: EffectTerm) -> bool:
+    def covers_zero(self, term: EffectTerm) -> bool:
         """Whether the strengths of ``term`` are within the 95 % credible region about the fitted values that holds
         zero. False for a term that takes the place of parameters: its absence is not zero."""
         if term.replaces_parameter:

@@ -176,7 +176,7 @@ def _weighed_effects(rounds: Sequence[Round]) -> set[str]:
     """Effects whose refit reached what the ranking promised and has an evidence, or a strength like zero: only these
     can be told not to act."""
     trials = [t for r in rounds for t in r.trials if t.converged]
-    return {t.effect for t in trials if t.like_zero or t.log_bayes_factor is not None}
+    return {t.effect for t in trials if t.covers_zero or t.log_bayes_factor is not None}
 
 
 def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperLimit]) -> float:
@@ -246,8 +246,7 @@ def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchS
 def _allowed(term: EffectTerm, fitted: ModelFit, rounds: Sequence[Round]) -> float:
     """How strong ``term`` may be in addition to ``fitted`` by the fits of the last credible set; 0 if it is in none."""
     posterior = rounds[-1].posterior if rounds else None
-    if posterior is None:
-        return 0.0
     wanted = frozenset((*fitted.model.effects, term.name))
-    own = [h for h in posterior.hypotheses if h.effects == wanted and wanted in posterior.credible_set()]
-    return max((limit_of_fit(h, term) for h in own), default=0.0)
+    if posterior is None or wanted not in posterior.credible_set():
+        return 0.0
+    return max(limit_of_fit(h, term) for h in posterior.hypotheses if h.effects == wanted)

@@ -32,7 +32,7 @@ from masiv.refinement.tasks import map_tasks
 from masiv.refinement.trials import Attempts, converged, try_effects
 from masiv.workers import TaskError
 
-MOST_ENDED = 3
+MOST_COMPLETED = 3
 """Effects of a round that are fitted to the end before they are judged."""
 
 
@@ -91,8 +91,8 @@ def _judged(
     act is fitted to the end before it is judged, as the models without it are."""
     without, fewer = [state.fit, *bases[1:]], len(state.fit.model.effects)
     posterior, trials = _posterior(state, without, trials, settings)
-    for _ in range(MOST_ENDED):
-        trial = _to_be_ended(posterior, trials, fewer)
+    for _ in range(MOST_COMPLETED):
+        trial = _to_be_completed(posterior, trials, fewer)
         if trial is None:
             break
         ended = [_completed(state, t, settings) if t is trial else t for t in trials]
@@ -100,7 +100,7 @@ def _judged(
     accepted = None
     trial = _most_probable(posterior, trials, fewer)
     if trial is not None and _named(posterior, fewer, settings):
-        final = trial if trial.ended else _completed(state, trial, settings)
+        final = trial if trial.completed else _completed(state, trial, settings)
         trials = [final if t is trial else t for t in trials]
         accepted = final if not final.impossible else None
     current = posterior.best(fewer)
@@ -112,16 +112,16 @@ def _named(posterior: Posterior, fewer: int, settings: SearchSettings) -> bool:
     return posterior.with_at_most(fewer) < settings.config.max_null_probability
 
 
-def _to_be_ended(posterior: Posterior, trials: Sequence[Trial], fewer: int) -> Trial | None:
+def _to_be_completed(posterior: Posterior, trials: Sequence[Trial], fewer: int) -> Trial | None:
     """What is to be fitted to the end: the most probable effect if it may act, else that with the nearest fit, unless
     its odds are negligible. Far from where a fit ends its evidence is wrong. None if both have ended."""
     first = _most_probable(posterior, trials, fewer)
-    if first is not None and not first.ended and frozenset(first.fitted.model.effects) in posterior.credible_set():
+    if first is not None and not first.completed and frozenset(first.fitted.model.effects) in posterior.credible_set():
         return first
     factors = {id(t): t.log_bayes_factor for t in trials if t.log_bayes_factor is not None and not t.impossible}
     possible = [t for t in trials if factors.get(id(t), -math.inf) > max([0.0, *factors.values()]) - NEGLIGIBLE]
     nearest = min(possible, key=lambda t: t.fitted.cost, default=None)
-    return None if nearest is None or nearest.ended else nearest
+    return None if nearest is None or nearest.completed else nearest
 
 
 def _most_probable(posterior: Posterior, trials: Sequence[Trial], fewer: int) -> Trial | None:
@@ -211,12 +211,12 @@ def _completed(state: SearchState, trial: Trial, settings: SearchSettings) -> Tr
     hypotheses, failed = _weighed(state, [best], [], settings)
     if not hypotheses:
         return replace(trial, fitted=best, impossible=(f"at its best fit, {failed[id(best)]}",))
-    done = replace(trial, fitted=hypotheses[0].with_posterior(), ended=True)
+    done = replace(trial, fitted=hypotheses[0].with_posterior(), completed=True)
     reasons = reasons_against(model, done.fitted, done.effect)
-    like_zero = hypotheses[0].like_zero(model.term(done.effect))
-    if like_zero:
+    covers_zero = hypotheses[0].covers_zero(model.term(done.effect))
+    if covers_zero:
         reasons.append("its strength cannot be told from zero: another grid or start changes it by as much")
-    return replace(done, impossible=tuple(reasons), like_zero=like_zero)
+    return replace(done, impossible=tuple(reasons), covers_zero=covers_zero)
 
 
 def with_free_places(state: SearchState, fitted: ModelFit) -> ModelFit:
