@@ -76,7 +76,10 @@ def _save(
     from masiv.twin.identified import IDENTIFIED_FILE, restore_identified, save_refined
 
     folder, scene = run.folder, run.scene
-    document = document_of(result)
+    document = {
+        **document_of(result),
+        "problems": stages.motion_problems(folder, scene, recording.whole.positions),
+    }
     old = baseline_twin(twin, result)
     new = refined_twin(twin, result) if result.changes_twin else old
     if request.relearn and result.changes_twin:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,11 @@ class Summary:
 
     data: dict[str, Any]
     text: str
+
+
+def problem_lines(problems: Iterable[str]) -> list[str]:
+    """As lines of ``Summary.text``."""
+    return [f"problem  {problem}" for problem in problems]
 
 
 @dataclass(frozen=True)

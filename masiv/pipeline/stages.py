@@ -50,6 +50,13 @@ def training_scene(run: RunFolder, scene: Scene) -> Scene:
     return as_reconstructed(visible, load_gaussians(run))
 
 
+def motion_problems(run: RunFolder, scene: Scene, positions: np.ndarray) -> list[str]:
+    """What is not measured in the motion ``positions`` (T, Q, 3) [m] of the first frames of ``scene``."""
+    from masiv.continuum.in_view import view_problems
+
+    return view_problems(scene.restricted(holdout_cameras=run.holdout_cameras), positions)
+
+
 def load_gaussians(run: RunFolder) -> DynamicGaussians:
     """The result of a finished reconstruct stage. Raises InputError."""
     from masiv.splat.dynamic import DynamicGaussians

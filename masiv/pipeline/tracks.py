@@ -18,6 +18,7 @@ from masiv.pipeline.requests import (
     SimulateRequest,
     Summary,
     ViewRequest,
+    problem_lines,
     refuse,
 )
 from masiv.pipeline.run import Run, settings
@@ -125,7 +126,7 @@ class TracksRun(Run):
         for name, row in law["parameters"].items():
             error = given_or_error(row["stderr"])
             lines.append(f"         {name.replace('_', ' ')} {row['value']:.4g} {row['unit']}" + error)
-        lines += [*_table(rows), *(f"problem  {problem}" for problem in problems), f"report   {self.folder.report}"]
+        lines += [*_table(rows), *problem_lines(problems), f"report   {self.folder.report}"]
         return Summary(data, "\n".join(lines))
 
     def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:

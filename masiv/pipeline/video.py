@@ -22,6 +22,7 @@ from masiv.pipeline.requests import (
     SimulateRequest,
     Summary,
     ViewRequest,
+    problem_lines,
     refuse,
 )
 from masiv.pipeline.run import Run, reopen_run, settings
@@ -129,7 +130,9 @@ class VideoRun(Run):
             data["mirror_plane"] = {"normal": made.mirror.normal.tolist(), "offset_m": made.mirror.offset}
             plane = f", {made.mirror}"
         error = "" if math.isnan(made.volume_log_sd) else f" ± {made.volume * made.volume_log_sd * 1e3:.2f}"
-        return Summary(data, f"{text}, {made.volume * 1e3:.2f}{error} litres{plane}")
+        data["problems"] = stages.motion_problems(self.folder, self.scene, made.positions)
+        lines = [f"{text}, {made.volume * 1e3:.2f}{error} litres{plane}"]
+        return Summary(data, "\n".join([*lines, *problem_lines(data["problems"])]))
 
     def identify(self, progress: Progress = silent) -> Summary:
         self.start()
@@ -158,10 +161,12 @@ class VideoRun(Run):
         progress("report", 1, 1)
         law = twin.law.description()
         data: dict[str, Any] = {"run": str(self.path), "report": str(folder.report), "law": law, "metrics": numbers}
+        data["problems"] = stages.motion_problems(folder, scene, trajectory.positions)
         families = twin.fit.get("families", [])
         if families:
             data["families"] = families
-        return Summary(data, f"{table(numbers)}\n{law_text(law, families)}report   {folder.report}")
+        told = "".join(f"{line}\n" for line in problem_lines(data["problems"]))
+        return Summary(data, f"{table(numbers)}\n{law_text(law, families)}{told}report   {folder.report}")
 
     def refine(self, request: RefineRequest, progress: Progress = silent) -> Summary:
         refuse(request, ("group", "condition"), "tracks", self.scene_path)

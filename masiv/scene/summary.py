@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from masiv.scene.assemble import format_ranges
 from masiv.scene.frame_cache import Frame
 from masiv.scene.scene import Scene
 
@@ -62,18 +63,20 @@ def summarise(scene: Scene, look: Callable[[int, int, Frame], None] = _ignore) -
     if scene.load_cloud is not None:
         return _summarise_clouds(scene)
     coverage = np.zeros((len(scene.views), scene.frame_count))
-    seen = np.zeros(coverage.shape, bool)
+    seen, cut = np.zeros(coverage.shape, bool), np.zeros(coverage.shape, bool)
     known: list[float] = []
     for frame in range(scene.frame_count):
         pictures = scene.map_views(frame, lambda _, picture: picture)
         for row, (view, picture) in enumerate(zip(scene.views, pictures, strict=True)):
             seen[row, frame] = picture.valid.any()
             coverage[row, frame] = picture.mask.mean()
+            cut[row, frame] = _at_the_edge(picture.mask)
             if picture.depth is not None and coverage[row, frame] > 0:
                 known.append(float((picture.depth[picture.mask > 0.5] > 0).mean()))
             look(view, frame, picture)
-    problems = [*scene.problems, *_coverage_problems(scene, coverage, seen)]
+    problems = [*scene.problems, *_coverage_problems(scene, coverage, seen), *_cut_problems(cut)]
     of_views = dict(zip(scene.views, seen.sum(axis=1).tolist(), strict=True))
+    cut_frames: dict[int, list[int]] = {v: np.flatnonzero(c).tolist() for v, c in zip(scene.views, cut, strict=True)}
     coverage = coverage[seen] if seen.any() else coverage
     return {
         "scene": str(scene.path),
@@ -97,6 +100,7 @@ def summarise(scene: Scene, look: Callable[[int, int, Frame], None] = _ignore) -
                 "time_offset_ms": None,
                 "time_offset_error_ms": None,
                 "flickering_frames": [],
+                "cut_frames": cut_frames.get(view, []),
             }
             for view, camera in enumerate(scene.cameras)
         ],
@@ -115,6 +119,23 @@ def _coverage_problems(scene: Scene, coverage: np.ndarray, seen: np.ndarray) -> 
             elif share > FULL:
                 problems.append(f"view {view} at frame {frame}: the mask covers {share:.0%} of the picture")
     return problems
+
+
+def _at_the_edge(mask: np.ndarray) -> bool:
+    """Whether the object in ``mask`` (H, W) goes on beyond the picture."""
+    return any((edge > 0.5).any() for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+
+
+def _cut_problems(cut: np.ndarray) -> list[str]:
+    """A sentence if the edge of the picture cuts the object. cut (V, F) bool."""
+    frames = np.flatnonzero(cut.any(axis=0))
+    if not len(frames):
+        return []
+    most = int(cut.sum(axis=0).max())
+    return [
+        f"frames {format_ranges(frames.tolist())}: the edge of the picture cuts the object in up to {most} of "
+        f"{len(cut)} views: what no two of them show is not measured; film from farther away, or leave these frames out"
+    ]
 
 
 def _summarise_clouds(scene: Scene) -> dict[str, Any]:
