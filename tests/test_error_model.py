@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from linear_model import NOISE, LinearModel, baseline
+from linear_model import NOISE, ONES, TIMES, LinearModel, baseline, pattern
 from scipy.stats import binom, chi2, multivariate_normal
 
 from masiv.inference.error_covariance import ErrorBlock, matern52
@@ -16,20 +16,20 @@ from masiv.inference.marginal_likelihood import ParameterPriors, SizePriors, mar
 from masiv.inference.model_fit import evaluate_fit
 from masiv.inference.predictive import forecast
 from masiv.inference.segments import effective_instants, independent_series
-from masiv.refinement.hypotheses import linearized, weighed
-from masiv.refinement.posterior_fit import CLOSE, posterior_fit
+from masiv.refinement.hypotheses import Linearizations, linearized, weighed
+from masiv.refinement.posterior_fit import CLOSE, linearized_at_mean, posterior_fit
 
 INSTANTS, STEP = 40, 0.1
 LAGS = STEP * np.abs(np.subtract.outer(np.arange(INSTANTS), np.arange(INSTANTS)))
-LOGS = np.log([1.5, 0.8, 0.4, 1.0])
-"""Of jitter, smooth errors, their length [s] and the grid's change."""
+LOGS = np.log([1.5, 0.8, 0.4, 1.0, 0.6])
+"""Of jitter, smooth errors, their length [s], the grid's change and its jitter."""
 
 
 def block(residual, motion=1e3, weight=1.0):
     count = len(residual)
     return ErrorBlock(
         residual, np.zeros((*residual.shape, 0)), LAGS[:count, :count], 0, 1.0, np.linspace(1, 2, count),
-        np.linspace(0, 1, count), 0.3, weight, motion,
+        np.linspace(0, 1, count), 0.3, weight, motion, grid_jitter=np.linspace(0, 2, count) ** 2,
     )  # fmt: skip
 
 
@@ -217,3 +217,30 @@ def test_a_strength_is_told_from_zero_by_its_own_posterior(strength, covers_zero
     fit = posterior_fit(model, baseline(model, ("viscosity",)), 1.0)
     (hypothesis,) = weighed(model, [(fit, linearized(model, fit))])
     assert hypothesis.covers_zero(model.term("viscosity")) is covers_zero
+
+
+class Turning(LinearModel):
+    """The points go back and forth the faster, the larger the velocity is: not linear."""
+
+    def motion(self, values):
+        return super().motion(values) + 0.1 * pattern(1, np.sin(8 * values.get("velocity_z", 0.0) * TIMES), ONES)
+
+
+def test_a_model_is_weighed_alike_wherever_its_fit_ended():
+    model = Turning({"velocity_z": 0.3})
+    best = posterior_fit(model, baseline(model), 1.0)
+    evidence = Evidence.of(model.observations, best.fields)
+    own, at_mean = [], []
+    for off in (0.0, 0.1, -0.1):
+        values = {"velocity_z": best.values["velocity_z"] + off}
+        fit = evaluate_fit(model, best.model, best.parameters, values, best.jacobian, robust_scale=1.0)
+        lines = linearized(model, fit), linearized_at_mean(model, fit, evidence, 1.0, Linearizations())
+        found = [weighed(model, [(fit, line)], evidence=evidence)[0] for line in lines]
+        own.append(found[0].marginal.log_evidence)
+        at_mean.append(found[1].marginal.log_evidence)
+        # It is as far from its posterior as it was moved, whatever it is linearised about.
+        assert found[1].with_posterior().stderr["velocity_z"] == pytest.approx(
+            np.hypot(off, best.stderr["velocity_z"]), rel=0.05
+        )
+    assert np.ptp(own) > 10
+    assert np.ptp(at_mean) < 0.1

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal, norm
 from masiv.inference.error_covariance import BlockCovariance, ErrorBlock, matern52
 from masiv.inference.marginal_likelihood import ParameterPriors, SizePriors, _Likelihood, marginal
 from masiv.inference.motion_modes import MotionModes, rotations_since_start
-from masiv.inference.segments import jitter_of
+from masiv.inference.segments import jitter_of, jitter_of_grids
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def block(rng, instants=9, modes=2, count=3, sizes=(1.0, 2.0), weight=1.0):
     return ErrorBlock(
         rng.normal(size=(instants, modes)), rng.normal(size=(instants, modes, count)),
         np.abs(np.subtract.outer(times, times)), 0, sizes[0], np.linspace(1, 2, instants) * sizes[1],
-        np.linspace(0, 1, instants), 0.3, weight,
+        np.linspace(0, 1, instants), 0.3, weight, grid_jitter=np.linspace(0, 2, instants) ** 2,
     )  # fmt: skip
 
 
@@ -67,12 +67,13 @@ def test_marginal_likelihood_is_that_of_a_dense_normal_density():
     rng = np.random.default_rng(1)
     b = block(rng)
     priors = ParameterPriors(np.array([0.0, -0.5, 0.2]), np.array([[0.1, 1.0, 4.0], [0.1, 0.2, 0.3]]))
-    logs = np.array([0.2, -0.3, np.log(0.25), 0.1])
+    logs = np.array([0.2, -0.3, np.log(0.25), 0.1, -0.4])
     terms = _Likelihood([b], priors, SizePriors.of([b])).terms(logs)
     values = np.exp(logs)
     c = (values[0] * b.jitter) ** 2 * np.eye(9)
     c += values[1] ** 2 * np.outer(b.smooth, b.smooth) * matern52(b.lags / values[2])
     c += values[3] ** 2 * np.outer(b.grid, b.grid) * matern52(b.lags / b.grid_length)
+    c += values[4] ** 2 * np.diag(b.grid_jitter) ** 2
     np.testing.assert_allclose(BlockCovariance(b)(logs), c, rtol=1e-7)
     dense = np.kron(c, np.eye(2))
     j, r = b.jacobian.reshape(18, 3), b.residual.reshape(18) + b.jacobian.reshape(18, 3) @ priors.mean
@@ -89,7 +90,7 @@ def test_a_strength_that_cannot_be_negative_has_the_mass_above_zero():
     rng = np.random.default_rng(2)
     b = block(rng, count=1)
     free, half = (ParameterPriors(np.array([0.3]), np.array([[0.5]]), p) for p in ((), (0,)))
-    whole, part = (_Likelihood([b], p, SizePriors.of([b])).terms(np.zeros(4)) for p in (free, half))
+    whole, part = (_Likelihood([b], p, SizePriors.of([b])).terms(np.zeros(5)) for p in (free, half))
     above = norm.sf(0.0, whole.mean[0, 0], whole.covariance[0, 0, 0] ** 0.5)
     assert part.logp[0] - whole.logp[0] == pytest.approx(np.log(2 * above))
 
@@ -100,7 +101,7 @@ def test_of_several_strengths_that_cannot_be_negative_one_may_be_near_zero():
     slope = block(rng).jacobian
     b = replace(block(rng), residual=-(slope[..., 1] * 3 - slope[..., 2] * 0.4), jacobian=slope)
     free, half = (ParameterPriors(np.zeros(3), np.array([[0.1, 1e-4, 1e-3]]), p) for p in ((), (1, 2)))
-    whole, part = (_Likelihood([b], p, SizePriors.of([b])).terms(np.zeros(4)) for p in (free, half))
+    whole, part = (_Likelihood([b], p, SizePriors.of([b])).terms(np.zeros(5)) for p in (free, half))
     mean, covariance = whole.mean[0, 1:], whole.covariance[0, 1:, 1:]
     assert mean[0] > 4 * covariance[0, 0] ** 0.5
     assert -4 * covariance[1, 1] ** 0.5 < mean[1] < 0
@@ -116,10 +117,10 @@ def test_gradient_by_the_sizes_is_that_of_finite_differences(positive):
     likelihood = _Likelihood(
         blocks, ParameterPriors(np.array([0.0, -0.5, 0.2]), precision, positive), SizePriors.of(blocks)
     )
-    at = np.array([0.2, -0.3, -1.0, 0.4])
+    at = np.array([0.2, -0.3, -1.0, 0.4, -0.2])
     _, gradient = likelihood.objective(at)
-    for k in range(4):
-        step = 1e-5 * np.eye(4)[k]
+    for k in range(5):
+        step = 1e-5 * np.eye(5)[k]
         slope = (likelihood.objective(at + step)[0] - likelihood.objective(at - step)[0]) / 2e-5
         assert gradient[k] == pytest.approx(slope, rel=1e-6)
 
@@ -137,6 +138,18 @@ def test_jitter_is_seen_under_a_smooth_motion():
     noise = np.random.default_rng(0).normal(0, 1e-3, smooth.shape)
     assert jitter_of(smooth + noise) == pytest.approx(1e-3, rel=0.25)
     assert jitter_of(smooth[:5]) == 0.0
+
+
+def test_what_grids_change_from_instant_to_instant_is_seen_where_it_is():
+    """Two grids differ smoothly from the start, and from instant 30 on by independent values as well."""
+    rng = np.random.default_rng(4)
+    apart = 1e-2 * np.sin(np.linspace(0, 2, 60))[:, None] * np.ones(40)
+    apart[30:] += 1e-3 * rng.normal(size=(30, 40))
+    found = jitter_of_grids(np.stack([apart, -apart]))
+    assert (found[:27] < 1e-5).all()
+    # A third grid is off the mean of two by the square root of three times as much as they are.
+    np.testing.assert_allclose(found[34:], np.sqrt(3) * 1e-3, rtol=0.35)
+    np.testing.assert_array_equal(jitter_of_grids(np.zeros((0, 60, 40))), np.zeros(60))
 
 
 def drawn(rng, slope, instants=40):

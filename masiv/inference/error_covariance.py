@@ -5,7 +5,7 @@ Each coefficient of group :math:`g` is a Gaussian process in time, independent o
 .. math::
 
     C_g(t, t') = j_g^2 \delta_{tt'} + s_g^2 u(t) u(t') k(|t - t'| / \ell_g)
-    + \gamma^2 d_g(t) d_g(t') k(|t - t'| / \ell_d)
+    + \gamma^2 d_g(t) d_g(t') k(|t - t'| / \ell_d) + \rho^2 r_g(t)^2 \delta_{tt'}
 
 with the Matern function :math:`k` of order 5/2 (Rasmussen & Williams 2006, eq. 4.17).
 """
@@ -28,7 +28,8 @@ class ErrorBlock:
 
     residual (T, K) [m]; jacobian (T, K, P) by the fitted scales of P parameters; lags (T, T) [s]. group: index of the
     mode group. jitter [m]: expected jitter of a coefficient; smooth (T,) [m]: expected size of smooth errors of a
-    coefficient; grid (T,) [m]: what another grid would change in it, zero if there is none. grid_length [s]. weight:
+    coefficient; grid (T,) [m]: what another grid would change in it, zero if there is none. grid_length [s];
+    grid_jitter (T,) [m]: the part of that which is independent from instant to instant, zero if not given. weight:
     power of the block's likelihood, below 1 if its modes are not independent of each other. motion: size of the motion
     over that of smooth errors, which errors cannot exceed. grids (S, T, K) [m]: by how much each of S grids differs
     from their mean; not given if there are none.
@@ -45,24 +46,28 @@ class ErrorBlock:
     weight: float = 1.0
     motion: float = 1e3
     grids: np.ndarray | None = None
+    grid_jitter: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class ErrorSizes:
     """Hyperparameters. jitter, smooth (G,): factors of each group on what a block expects; length (G,) [s]: correlation
-    time of smooth errors; grid: factor on what another grid changes."""
+    time of smooth errors; grid, grid_jitter: factors on what another grid changes, smoothly and from instant to
+    instant."""
 
     jitter: np.ndarray
     smooth: np.ndarray
     length: np.ndarray
     grid: float
+    grid_jitter: float
 
     @classmethod
     def of_logarithms(cls, logs: np.ndarray) -> ErrorSizes:
-        """From ``logs`` (3 G + 1,)."""
+        """From ``logs`` (3 G + 2,)."""
         values = np.exp(logs)
         groups = len(values) // 3
-        return cls(values[:groups], values[groups : 2 * groups], values[2 * groups : 3 * groups], float(values[-1]))
+        of_groups = values[:groups], values[groups : 2 * groups], values[2 * groups : 3 * groups]
+        return cls(*of_groups, float(values[-2]), float(values[-1]))
 
 
 def matern52(distance: np.ndarray) -> np.ndarray:
@@ -78,34 +83,38 @@ def matern52_by_log_length(distance: np.ndarray) -> np.ndarray:
 
 
 class BlockCovariance:
-    """C (T, T) [m²] of ``block`` as a function of the logarithms of the sizes (3 G + 1,)."""
+    """C (T, T) [m²] of ``block`` as a function of the logarithms of the sizes (3 G + 2,)."""
 
     def __init__(self, block: ErrorBlock) -> None:
         self.block = block
         self._smooth = np.outer(block.smooth, block.smooth)
         self._nugget = NUGGET * np.eye(len(block.lags))
         self._grid = np.outer(block.grid, block.grid) * (matern52(block.lags / block.grid_length) + self._nugget)
+        rough = np.zeros(len(block.lags)) if block.grid_jitter is None else block.grid_jitter
+        self._rough = np.diag(rough**2)
 
-    def _parts(self, logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    def _parts(self, logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         values, groups, g = np.exp(logs), len(logs) // 3, self.block.group
         smooth = values[groups + g] ** 2 * self._smooth
-        return float(self.block.jitter * values[g]) ** 2, smooth, values[-1] ** 2 * self._grid
+        jitter = float(self.block.jitter * values[g]) ** 2
+        return jitter, smooth, values[-2] ** 2 * self._grid, values[-1] ** 2 * self._rough
 
     def _distance(self, logs: np.ndarray) -> np.ndarray:
         return self.block.lags / np.exp(logs[2 * (len(logs) // 3) + self.block.group])
 
     def __call__(self, logs: np.ndarray) -> np.ndarray:
-        jitter, smooth, grid = self._parts(logs)
-        return jitter * np.eye(len(grid)) + smooth * (matern52(self._distance(logs)) + self._nugget) + grid
+        jitter, smooth, grid, rough = self._parts(logs)
+        return jitter * np.eye(len(grid)) + smooth * (matern52(self._distance(logs)) + self._nugget) + grid + rough
 
     def gradient(self, logs: np.ndarray, by_covariance: np.ndarray) -> np.ndarray:
-        """Gradient (3 G + 1,) of a function by the logarithms, from that by C (T, T)."""
-        jitter, smooth, grid = self._parts(logs)
+        """Gradient (3 G + 2,) of a function by the logarithms, from that by C (T, T)."""
+        jitter, smooth, grid, rough = self._parts(logs)
         distance = self._distance(logs)
         groups, g = len(logs) // 3, self.block.group
         out = np.zeros(len(logs))
         out[g] = 2 * jitter * np.trace(by_covariance)
         out[groups + g] = 2 * float((by_covariance * smooth * (matern52(distance) + self._nugget)).sum())
         out[2 * groups + g] = float((by_covariance * smooth * matern52_by_log_length(distance)).sum())
-        out[-1] = 2 * float((by_covariance * grid).sum())
+        out[-2] = 2 * float((by_covariance * grid).sum())
+        out[-1] = 2 * float((by_covariance * rough).sum())
         return out

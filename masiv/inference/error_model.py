@@ -17,7 +17,7 @@ LOG2PI = math.log(2 * math.pi)
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """What a model that lacks nothing leaves of ``blocks``, with sizes whose logarithms are ``logs`` (3 G + 1,).
+    """What a model that lacks nothing leaves of ``blocks``, with sizes whose logarithms are ``logs`` (3 G + 2,).
 
     Methods take coefficients (T, K) of each block, or of its first instants. A block's power (``ErrorBlock.weight``)
     below 1 says that its K series are dependent: they count as K times that many.

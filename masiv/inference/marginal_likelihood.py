@@ -25,8 +25,13 @@ from masiv.inference.error_covariance import BlockCovariance, ErrorBlock, ErrorS
 
 JITTER_SD, SMOOTH_SD, GRID_SD = 0.7, 1.0, 0.5
 """Standard deviations of the logarithms of the factors: the expected sizes are good to a factor of two or three."""
-STARTS = ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.5, 0.0), (-2.0, 0.0, 0.5, 0.0), (-2.0, -1.0, -1.0, 3.0))
-"""Where fits of the sizes begin, in standard deviations of their priors: jitter, smooth, length, grid."""
+STARTS = (
+    (0.0, 0.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, -1.5, 0.0, 0.0),
+    (-2.0, 0.0, 0.5, 0.0, -1.0),
+    (-2.0, -1.0, -1.0, 3.0, 0.0),
+)
+"""Where fits of the sizes begin, in standard deviations of their priors: jitter, smooth, length, grid, its jitter."""
 MAX_FITS = 2
 """Of which the most probable ones go on."""
 REACH = 6.0
@@ -55,7 +60,7 @@ class ParameterPriors:
 class Marginal:
     """log_evidence: logarithm of the marginal likelihood. mean, covariance: of the parameters less their fitted values,
     (P,) and (P, P), over the mixture; what one more grid would change in the mean is in the covariance. logs (3 G +
-    1,): logarithms of the sizes of the errors (``ErrorSizes``). unknown: posterior probability that something unknown
+    2,): logarithms of the sizes of the errors (``ErrorSizes``). unknown: posterior probability that something unknown
     acts as well."""
 
     log_evidence: float
@@ -71,7 +76,7 @@ class Marginal:
 
 @dataclass(frozen=True)
 class SizePriors:
-    """Normal priors of ``logs`` (3 G + 1,), see ``ErrorSizes``."""
+    """Normal priors of ``logs`` (3 G + 2,), see ``ErrorSizes``."""
 
     mean: np.ndarray
     sd: np.ndarray
@@ -87,8 +92,8 @@ class SizePriors:
             longest = np.log(max(float(b.lags.max()) for b in own))
             shortest = np.log(np.median([_interval(b.lags) for b in own]))
             lengths[g], spreads[g] = 0.5 * (longest + shortest), max((longest - shortest) / 4, 0.3)
-        mean = np.concatenate([np.zeros(2 * groups), lengths, [0.0]])
-        sd = np.concatenate([np.full(groups, JITTER_SD), np.full(groups, SMOOTH_SD), spreads, [GRID_SD]])
+        mean = np.concatenate([np.zeros(2 * groups), lengths, np.zeros(2)])
+        sd = np.concatenate([np.full(groups, JITTER_SD), np.full(groups, SMOOTH_SD), spreads, [GRID_SD, SMOOTH_SD]])
         return cls(mean, sd)
 
     def with_unknown(self, blocks: Sequence[ErrorBlock]) -> SizePriors:
@@ -107,7 +112,7 @@ class SizePriors:
         """Sizes from which their fit begins, in standard deviations from the mean: as expected, rough, smooth, and with
         more of another grid."""
         groups = len(self.mean) // 3
-        return [np.array([*np.repeat(start[:3], groups), start[3]]) for start in STARTS]
+        return [np.array([*np.repeat(start[:3], groups), *start[3:]]) for start in STARTS]
 
 
 def _interval(lags: np.ndarray) -> float:
@@ -225,7 +230,7 @@ def marginal(
     blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors, starts: Sequence[np.ndarray] = ()
 ) -> Marginal:
     """The marginal likelihood of ``blocks``, over all of them: a composite likelihood (Varin, Reid & Firth 2011) if
-    their weights are not 1. starts: logarithms of the sizes (3 G + 1,) from which their fit begins; usual ones if there
+    their weights are not 1. starts: logarithms of the sizes (3 G + 2,) from which their fit begins; usual ones if there
     are none."""
     likelihood = _Likelihood(blocks, priors, sizes)
 

@@ -37,9 +37,9 @@ class Segment:
     kept: instants (T,), of which the first ``decided`` take part in decisions and the rest is for the test; what is
     expected is found from the former alone. turned: see ``MotionModes.coefficients``. jitter (G,) [m]: expected jitter
     of a coefficient; smooth (T,) [m]: expected smooth error of a point along an axis; grid: of each group, (T,) [m] by
-    which another grid may change a coefficient; grids: of each group, (S, T, K_g) [m] by which those that were tried
-    differ from their mean; weights (G,): powers of the likelihood of each group; first_group:
-    number of groups of other kinds of segments.
+    which another grid may change a coefficient, and grid_jitter: the part of that which is independent from instant to
+    instant; grids: of each group, (S, T, K_g) [m] by which those that were tried differ from their mean; weights (G,):
+    powers of the likelihood of each group; first_group: number of groups of other kinds of segments.
     """
 
     index: int
@@ -51,6 +51,7 @@ class Segment:
     jitter: tuple[float, ...]
     smooth: np.ndarray
     grid: tuple[np.ndarray, ...]
+    grid_jitter: tuple[np.ndarray, ...]
     grids: tuple[np.ndarray, ...]
     weights: tuple[float, ...]
     first_group: int
@@ -71,7 +72,7 @@ class Segment:
             positions = np.where(np.isfinite(observation.values), observation.values, observation.points)
             turned = rotations_since_start(observation.points, positions[kept].astype(np.float64))
         grids = _grid_changes(observation, modes, kept, turned)
-        grid = tuple(map(_one_more, grids))
+        grid, grid_jitter = tuple(map(_one_more, grids)), tuple(map(jitter_of_grids, grids))
         known = observation.observation_std[kept] / math.sqrt(axes)
         floor = float(known.min()) / math.sqrt(count)
         known_turn = None if turned is None else turned[:decided]
@@ -89,8 +90,8 @@ class Segment:
             out.append(
                 cls(
                     index, observation, modes, kept[part], count, own, jitter, smooth[part],
-                    tuple(g[part] for g in grid), tuple(g[:, part] for g in grids), _weights(parts, together=late),
-                    len(modes.names) if late else 0,
+                    tuple(g[part] for g in grid), tuple(g[part] for g in grid_jitter), tuple(g[:, part] for g in grids),
+                    _weights(parts, together=late), len(modes.names) if late else 0,
                 )
             )  # fmt: skip
         return out
@@ -111,7 +112,7 @@ class Segment:
                 residual, derivatives, lags, self.first_group + group, self.jitter[group],
                 self.smooth[part] * math.sqrt(self.modes.axes / (residual.shape[1] * groups)), self.grid[group][part],
                 GRID_CORRELATION * float(self.observation.times[-1]), self.weights[group], motion,
-                self.grids[group][:, part],
+                self.grids[group][:, part], self.grid_jitter[group][part],
             )
             for group, (residual, derivatives) in enumerate(zip(residuals, jacobians, strict=True))
         ]  # fmt: skip
@@ -190,5 +191,20 @@ def _one_more(grids: np.ndarray) -> np.ndarray:
     count = len(grids)
     if count == 0:
         return np.zeros(grids.shape[1])
-    more = math.sqrt((count + 1) / (count - 1))
-    return more * np.maximum.accumulate(np.sqrt((grids**2).mean(2).mean(0)))
+    return _more(count) * np.maximum.accumulate(np.sqrt((grids**2).mean(2).mean(0)))
+
+
+def _more(count: int) -> float:
+    """By how many times more one more draw differs from the mean of ``count`` than these do."""
+    return math.sqrt((count + 1) / (count - 1))
+
+
+def jitter_of_grids(grids: np.ndarray) -> np.ndarray:
+    """The same (T,) of what is not smooth in time: the root mean square of the third differences that an instant is
+    part of, in units of those of independent values. A contact sets in at another instant on each grid."""
+    count, instants = grids.shape[:2]
+    if count == 0 or instants <= DIFFERENCES:
+        return np.zeros(instants)
+    squares = (np.diff(grids, DIFFERENCES, axis=1) ** 2).mean((0, 2)) / DIFFERENCE_VARIANCE
+    windows = np.convolve(squares, np.ones(DIFFERENCES + 1))
+    return _more(count) * np.sqrt(windows / np.convolve(np.ones(len(squares)), np.ones(DIFFERENCES + 1)))

@@ -18,8 +18,8 @@ from masiv.inference.model_fit import ModelFit, gauss_newton_fit, held_parameter
 from masiv.models.base import EffectTerm, ForwardModel, Model
 from masiv.refinement.hypotheses import NEGLIGIBLE, Hypothesis, evidence_of, weighed
 from masiv.refinement.limits import extended, sensitivity
+from masiv.refinement.refits import reasons_against, with_free_places
 from masiv.refinement.rounds import Exchange
-from masiv.refinement.search_round import reasons_against, with_free_places
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks
 from masiv.workers import TaskError

@@ -33,7 +33,8 @@ Linearized = tuple[ModelFit, LinearModel]
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A law with effects, fitted, and linearised about the fit over all instants. marginal: its evidence."""
+    """A law with effects, fitted, and linearised over all instants, about the fit or what is more probable near it
+    (``linear.values``). marginal: its evidence."""
 
     fitted: ModelFit
     linear: LinearModel
@@ -52,20 +53,31 @@ class Hypothesis:
         """Largest distance of a fitted value from its posterior mean, in standard deviations of the posterior."""
         own = [k for k, p in enumerate(self.linear.parameters) if p.name in self.fitted.values]
         spread = np.sqrt(np.diag(self.marginal.covariance)[own])
-        return float((np.abs(self.marginal.mean[own]) / spread).max(initial=0.0))
+        return float((np.abs(self._mean_from_fit[own]) / spread).max(initial=0.0))
 
-    def mean_values(self, values: Mapping[str, float]) -> dict[str, float]:
-        """``values``, at which the model was linearised, moved to the mean of the posterior, within the bounds of its
-        parameters."""
-        changes = zip(self.linear.parameters, self.marginal.mean, strict=False)
+    def mean_values(self, values: Mapping[str, float], part: float = 1.0) -> dict[str, float]:
+        """``values``, at which the model was linearised, moved by a ``part`` of the way to the mean of the posterior,
+        within the bounds of its parameters."""
+        changes = zip(self.linear.parameters, part * self.marginal.mean, strict=False)
         moved = {p.name: p.value(p.fitted(values[p.name]) + float(d)) for p, d in changes if p.name in values}
         return {**values, **moved}
+
+    @property
+    def _mean_from_fit(self) -> np.ndarray:
+        """Mean of the posterior less the fitted values (P,)."""
+        values, at = self.fitted.values, self.linear.values
+        moved = [p.fitted(at[p.name]) - p.fitted(values[p.name]) if p.name in values else 0.0
+                 for p in self.linear.parameters]  # fmt: skip
+        out = self.marginal.mean.copy()
+        out[: len(moved)] += moved
+        return out
 
     @property
     def second_moment(self) -> np.ndarray:
         """Of the posterior about the fitted values, (P, P): errors of law, initial state and noise, and of a fit that
         is not at the mean of the posterior."""
-        return self.marginal.covariance + np.outer(self.marginal.mean, self.marginal.mean)
+        mean = self._mean_from_fit
+        return self.marginal.covariance + np.outer(mean, mean)
 
     def covers_zero(self, term: EffectTerm) -> bool:
         """Whether the strengths of ``term`` are within the 95 % credible region about the fitted values that holds

@@ -107,7 +107,7 @@ def limit_of_fit(hypothesis: Hypothesis, term: EffectTerm) -> float:
     linear model of ``upper_limit`` holds near zero alone."""
     names = [p.name for p in hypothesis.linear.parameters]
     index = [names.index(p.name) for p in term.strengths]
-    values = [p.fitted(hypothesis.fitted.values[p.name]) for p in term.strengths]
+    values = [p.fitted(hypothesis.linear.values[p.name]) for p in term.strengths]
     mean, covariance = hypothesis.marginal.mean[index] + values, hypothesis.marginal.covariance[np.ix_(index, index)]
     draws = np.random.default_rng(0).multivariate_normal(mean, covariance, DRAWS, method="eigh")
     return float(np.quantile(np.linalg.norm(draws, axis=1), LEVEL))

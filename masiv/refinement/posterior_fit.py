@@ -7,6 +7,7 @@ not linear.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from masiv.errors import NonFiniteError
 from masiv.inference.error_model import ErrorModel
 from masiv.inference.evidence import Evidence
+from masiv.inference.linear_model import LinearModel
 from masiv.inference.model_fit import ModelFit, evaluate_fit
 from masiv.models.base import ForwardModel
 from masiv.refinement.hypotheses import Hypothesis, Linearizations
@@ -23,6 +25,8 @@ PROBABLE = 0.5
 """Probability of something unknown above which the errors of a model are not those that were expected."""
 CLOSE = 0.1
 """Distance from the posterior mean, in its standard deviations, that is no longer worth a step."""
+PARTS_OF_STEP = (1.0, 0.5, 0.25)
+"""Of the way to the posterior mean, which are tried one after the other."""
 
 
 def posterior_fit(
@@ -36,21 +40,42 @@ def posterior_fit(
     known = linearizations or Linearizations()
     here = _Point.of(forward_model, fitted, known)
     for _ in range(STEPS):
-        if here.hypothesis.distance_from_mean <= CLOSE or here.hypothesis.marginal.unknown > PROBABLE:
+        moved = here.stepped(forward_model, robust_scale, lambda found: not _worse(found, fitted))
+        if moved is None:
             break
         try:
-            moved = here.moved(forward_model, robust_scale)
-            if here.log_density(moved) <= here.log_density(here.hypothesis.fitted) or _worse(moved, fitted):
-                break
             here = _Point.of(forward_model, moved, known)
         except NonFiniteError:
             break
     return here.hypothesis.with_posterior()
 
 
+def linearized_at_mean(
+    forward_model: ForwardModel, fitted: ModelFit, evidence: Evidence, robust_scale: float,
+    linearizations: Linearizations,
+) -> LinearModel:  # fmt: skip
+    """The model of ``fitted`` linearised about the mean of its posterior with the errors of ``evidence``, as near as
+    steps lead that make its residual more probable: Laplace's method asks for it. Raises NonFiniteError if ``fitted``
+    cannot be linearised."""
+    here = _Point.of(forward_model, fitted, linearizations, evidence)
+    for _ in range(STEPS):
+        moved = here.stepped(forward_model, robust_scale)
+        if moved is None:
+            break
+        try:
+            here = _Point.of(forward_model, moved, linearizations, evidence)
+        except NonFiniteError:
+            break
+    return here.hypothesis.linear
+
+
 def _worse(moved: ModelFit, fitted: ModelFit) -> bool:
     """Whether instants for validation are farther off; False if there are none."""
     return (moved.validation_mm or 0.0) > (fitted.validation_mm or 0.0)
+
+
+def _any(_: ModelFit) -> bool:
+    return True
 
 
 @dataclass(frozen=True)
@@ -61,20 +86,37 @@ class _Point:
     hypothesis: Hypothesis
 
     @classmethod
-    def of(cls, forward_model: ForwardModel, fitted: ModelFit, linearizations: Linearizations) -> _Point:
-        """Raises NonFiniteError."""
+    def of(
+        cls, forward_model: ForwardModel, fitted: ModelFit, linearizations: Linearizations,
+        evidence: Evidence | None = None,
+    ) -> _Point:  # fmt: skip
+        """evidence: with other errors than those that ``fitted`` leaves. Raises NonFiniteError."""
         line = linearizations.of(forward_model, fitted)
-        evidence = Evidence.of(forward_model.observations, line.fields)
+        evidence = evidence or Evidence.of(forward_model.observations, line.fields)
         terms = [forward_model.term(n) for n in fitted.model.effects]
         return cls(evidence, Hypothesis(fitted, line, evidence.marginal(line, terms)))
 
-    def moved(self, forward_model: ForwardModel, robust_scale: float) -> ModelFit:
-        """The fit at the mean of the posterior, within the bounds of its parameters. Raises NonFiniteError."""
-        fitted = self.hypothesis.fitted
-        values = self.hypothesis.mean_values(fitted.values)
-        return evaluate_fit(
-            forward_model, fitted.model, fitted.parameters, values, fitted.jacobian, robust_scale=robust_scale
-        )
+    def stepped(
+        self, forward_model: ForwardModel, robust_scale: float, allowed: Callable[[ModelFit], bool] = _any
+    ) -> ModelFit | None:
+        """The fit nearer to the mean of the posterior, within the bounds of its parameters; None if it is there, if
+        something unknown probably acts, or if no part of the way is ``allowed`` and makes the residual more
+        probable."""
+        known = self.hypothesis
+        if known.distance_from_mean <= CLOSE or known.marginal.unknown > PROBABLE:
+            return None
+        fitted, here = known.fitted, self.log_density(known.fitted)
+        for part in PARTS_OF_STEP:
+            try:
+                moved = evaluate_fit(
+                    forward_model, fitted.model, fitted.parameters, known.mean_values(fitted.values, part),
+                    fitted.jacobian, robust_scale=robust_scale,
+                )  # fmt: skip
+            except NonFiniteError:
+                continue
+            if self.log_density(moved) > here and allowed(moved):
+                return moved
+        return None
 
     def log_density(self, fitted: ModelFit) -> float:
         """Of the residual of ``fitted`` under the errors of this point; what is no value of a fit, such as the start of

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from masiv.effects.catalogue import effect_named
 from masiv.errors import MasivError
 from masiv.inference.model_fit import (
     ModelFit,
     gauss_newton_fit,
     held_parameters,
     linear_strengths,
+    rank_by_bic,
 )
-from masiv.models.base import ForwardModel
+from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.rounds import Trial
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks
@@ -124,3 +126,34 @@ def restart_base(state: SearchState, best: ModelFit) -> ModelFit:
     except MasivError:
         return base
     return min(base, again, key=lambda f: f.cost)
+
+
+def reasons_against(forward_model: ForwardModel, fitted: ModelFit, name: str) -> list[str]:
+    """Why the term ``name`` cannot act as it was fitted; empty if it can."""
+    term = forward_model.term(name)
+    return [*forward_model.impossible(fitted, term), *parameters_at_bounds(fitted, term)]
+
+
+def parameters_at_bounds(fitted: ModelFit, term: EffectTerm) -> list[str]:
+    """Which parameters of ``term`` ran into the bound of what is possible."""
+    # What acts on the matter at a place may well be at the body's face, where its place ends.
+    bounded = term.strengths if effect_named(term.effect).hints.inside else term.parameters
+    return [
+        f"{p.name} runs into the bound of what is possible, {p.upper:g}"
+        for p in bounded
+        if fitted.values[p.name] >= p.upper - 1e-9 * abs(p.upper)
+    ]
+
+
+def with_free_places(state: SearchState, fitted: ModelFit) -> ModelFit:
+    """``fitted`` with what was left at a guess fitted as well, if the information criterion asks for it."""
+    if not held_parameters(state.forward_model, fitted):
+        return fitted
+    budget = 3 * (len(fitted.values) + 1)
+    try:
+        free = gauss_newton_fit(
+            state.forward_model, fitted.model, fitted.values, budget=budget, robust_scale=state.robust_scale
+        )
+    except MasivError:
+        return fitted
+    return rank_by_bic([fitted, free])[0]
