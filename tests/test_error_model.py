@@ -244,3 +244,16 @@ def test_a_model_is_weighed_alike_wherever_its_fit_ended():
         )
     assert np.ptp(own) > 10
     assert np.ptp(at_mean) < 0.1
+
+
+def test_fits_that_are_asked_for_twice_are_linearised_once_and_in_order():
+    model = LinearModel({"velocity_z": 0.3})
+    one, other = baseline(model), baseline(model, ("viscosity",))
+    known = Linearizations()
+    lines = list(known.each(model, [one, one, other, one]))
+    assert [line.values for line in lines] == [f.values for f in (one, one, other, one)]
+    assert lines[0] is lines[1] is lines[3]
+    assert known.of(model, other) is lines[2]
+    near = list(known.nearly(model, [(other, lines[0]), (other, lines[0])]))
+    assert near[0] is near[1]
+    np.testing.assert_allclose(near[0].jacobians[0], lines[2].jacobians[0])  # it is linear

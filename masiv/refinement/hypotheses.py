@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -120,28 +120,43 @@ class Linearizations:
 
     def __init__(self, workers: Workers | None = None) -> None:
         self.workers = workers or Workers()
-        self._known: dict[tuple, tuple[ForwardModel, LinearModel]] = {}  # the forward model keeps its id its own
+        # What a key has the id of is kept, so that the id stays its own.
+        self._known: dict[tuple, tuple[LinearModel, ForwardModel, tuple]] = {}
 
     def of(self, forward_model: ForwardModel, fitted: ModelFit) -> LinearModel:
         """Raises NonFiniteError."""
         key = _identity(forward_model, fitted)
         if key not in self._known:
-            self._known[key] = forward_model, linearized(forward_model, fitted)
-        return self._known[key][1]
+            self._known[key] = linearized(forward_model, fitted), forward_model, ()
+        return self._known[key][0]
 
     def each(self, forward_model: ForwardModel, fits: Sequence[ModelFit]) -> Iterator[LinearModel | TaskError]:
         """Of ``fits``, in order."""
-        missing = [f for f in fits if _identity(forward_model, f) not in self._known]
-        found = map_tasks(self.workers, forward_model, linearized, [(f,) for f in missing])
-        for fit in fits:
-            key = _identity(forward_model, fit)
-            if key in self._known:
-                yield self._known[key][1]
-                continue
-            line = next(found)
-            if not isinstance(line, TaskError):
-                self._known[key] = forward_model, line
-            yield line
+        tasks = [(_identity(forward_model, f), (f,)) for f in fits]
+        return self._worked_out(forward_model, linearized, tasks)
+
+    def nearly(
+        self, forward_model: ForwardModel, pairs: Sequence[tuple[ModelFit, LinearModel]]
+    ) -> Iterator[LinearModel | TaskError]:
+        """``nearly_linearized`` of pairs of a fit and its base, in order."""
+        tasks = [((*_identity(forward_model, fit), id(base)), (fit, base)) for fit, base in pairs]
+        return self._worked_out(forward_model, nearly_linearized, tasks)
+
+    def _worked_out(
+        self, forward_model: ForwardModel, function: Callable[..., LinearModel], tasks: Sequence[tuple[tuple, tuple]]
+    ) -> Iterator[LinearModel | TaskError]:
+        """``function`` of the arguments of each of ``tasks``, which have a key."""
+        missing = {key: arguments for key, arguments in tasks if key not in self._known}
+        found = iter(map_tasks(self.workers, forward_model, function, list(missing.values())))
+        failed: dict[tuple, TaskError] = {}
+        for key, arguments in tasks:
+            if key not in self._known and key not in failed:
+                line = next(found)
+                if isinstance(line, TaskError):
+                    failed[key] = line
+                else:
+                    self._known[key] = line, forward_model, arguments
+            yield failed[key] if key in failed else self._known[key][0]
 
 
 def _identity(forward_model: ForwardModel, fitted: ModelFit) -> tuple:

@@ -18,14 +18,12 @@ from masiv.refinement.hypotheses import (
     Linearized,
     Posterior,
     evidence_of,
-    nearly_linearized,
     weighed,
 )
 from masiv.refinement.posterior_fit import linearized_at_mean
 from masiv.refinement.refits import reasons_against, with_free_places
 from masiv.refinement.rounds import Trial
 from masiv.refinement.search_state import SearchSettings, SearchState
-from masiv.refinement.tasks import map_tasks
 from masiv.workers import TaskError
 
 
@@ -132,8 +130,8 @@ def _weighed(
     near = {id(f): next((line for other, line in bases if _extends(f, other)), None) for f in left}
     others, why = _linearized(state, [f for f in left if near[id(f)] is None], settings)
     rough = [f for f in left if near[id(f)] is not None]
-    tasks = [(f, near[id(f)]) for f in rough]
-    lines = list(zip(rough, map_tasks(workers, model, nearly_linearized, tasks), strict=True))
+    pairs = [(f, line) for f in rough if (line := near[id(f)]) is not None]
+    lines = list(zip(rough, settings.linearizations.nearly(model, pairs), strict=True))
     failed |= why | {id(f): line.reason for f, line in lines if isinstance(line, TaskError)}
     known = [
         *((f, at_mean.get(id(f), line)) for f, line in bases), *others,
