@@ -211,14 +211,6 @@ def test_standard_errors_hold_how_far_a_fit_is_from_the_mean_of_its_posterior():
     )
 
 
-@pytest.mark.parametrize(("strength", "covers_zero"), [(0.0, True), (0.3, False)])
-def test_a_strength_is_told_from_zero_by_its_own_posterior(strength, covers_zero):
-    model = LinearModel({"velocity_z": 0.3, "viscosity.strength": strength})
-    fit = posterior_fit(model, baseline(model, ("viscosity",)), 1.0)
-    (hypothesis,) = weighed(model, [(fit, linearized(model, fit))])
-    assert hypothesis.covers_zero(model.term("viscosity")) is covers_zero
-
-
 class Turning(LinearModel):
     """The points go back and forth the faster, the larger the velocity is: not linear."""
 

@@ -2,8 +2,8 @@
 Regression).
 
 A search that adds one effect at a time keeps what it found first, when the others were still missing: a drag that is
-linear, and later a force with it, for one that is quadratic. So once a second effect was accepted, each of those before
-it is compared with what else may act in its place.
+linear, and later a force with it, for one that is quadratic. So once a second effect was accepted or may act, each of
+those before it is compared with what else may act in its place.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from masiv.inference.model_fit import ModelFit, gauss_newton_fit, held_parameter
 from masiv.models.base import EffectTerm, ForwardModel, Model
 from masiv.refinement.hypotheses import NEGLIGIBLE, Hypothesis, evidence_of, weighed
 from masiv.refinement.limits import extended, sensitivity
+from masiv.refinement.posterior_fit import linearized_at_mean
 from masiv.refinement.refits import reasons_against, with_free_places
 from masiv.refinement.rounds import Exchange
 from masiv.refinement.search_state import SearchSettings, SearchState
@@ -97,7 +98,11 @@ def _best_exchange(
     if not known:
         return None
     pairs = [(here, line), *known.values()]
-    first, *others = weighed(model, pairs, settings.workers, evidence_of(model, pairs))
+    evidence = evidence_of(model, pairs)
+    at_mean = [
+        (fit, linearized_at_mean(model, fit, evidence, state.robust_scale, settings.linearizations)) for fit, _ in pairs
+    ]
+    first, *others = weighed(model, at_mean, settings.workers, evidence)
     (old, new), best = max(zip(known, others, strict=True), key=lambda row: row[1].marginal.log_evidence)
     factor = best.marginal.log_evidence - first.marginal.log_evidence
     return (best.with_posterior(), Exchange(old, new, factor)) if factor > 0 else None

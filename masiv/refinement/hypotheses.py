@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from scipy.stats import chi2
 
 from masiv.inference.evidence import GRAVITY_EFFECT, Evidence
 from masiv.inference.linear_model import LinearModel, linear_model
 from masiv.inference.marginal_likelihood import Marginal
 from masiv.inference.model_fit import ModelFit
-from masiv.models.base import EffectTerm, ForwardModel
+from masiv.models.base import ForwardModel
 from masiv.refinement.tasks import map_tasks
 from masiv.workers import TaskError, Workers, unwrap
 
@@ -78,17 +77,6 @@ class Hypothesis:
         is not at the mean of the posterior."""
         mean = self._mean_from_fit
         return self.marginal.covariance + np.outer(mean, mean)
-
-    def covers_zero(self, term: EffectTerm) -> bool:
-        """Whether the strengths of ``term`` are within the 95 % credible region about the fitted values that holds
-        zero. False for a term that takes the place of parameters: its absence is not zero."""
-        if term.replaces_parameter:
-            return False
-        names = [p.name for p in self.linear.parameters]
-        index = [names.index(p.name) for p in term.strengths]
-        values = np.array([self.fitted.values[p.name] for p in term.strengths])
-        squared = values @ np.linalg.solve(self.second_moment[np.ix_(index, index)], values)
-        return bool(squared < chi2.ppf(CREDIBLE, len(index)))
 
     def with_posterior(self) -> ModelFit:
         """The fit with the root mean square distances of the posterior from its values as standard errors."""

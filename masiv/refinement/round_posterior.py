@@ -79,6 +79,15 @@ class RoundPosterior:
         trials = [done if t is trial else t for t in self.trials]
         return RoundPosterior.of(state, without, trials, settings, at_mean)
 
+    def with_trial(
+        self, state: SearchState, without: Sequence[ModelFit], trial: Trial, settings: SearchSettings
+    ) -> RoundPosterior:
+        """With one more ``trial``, whose fit has ended. Raises MasivError."""
+        at_mean = dict(self.at_mean)
+        with suppress(NonFiniteError):
+            at_mean[id(trial.fitted)] = self._at_mean(state, trial.fitted, settings)
+        return RoundPosterior.of(state, without, [*self.trials, trial], settings, at_mean)
+
     def _at_mean(self, state: SearchState, fit: ModelFit, settings: SearchSettings) -> LinearModel:
         """Raises NonFiniteError."""
         return linearized_at_mean(state.forward_model, fit, self.evidence, state.robust_scale, settings.linearizations)
@@ -101,11 +110,7 @@ class RoundPosterior:
             return replace(trial, fitted=best, completed=True, impossible=(reason,)), None
         (hypothesis,) = weighed(model, [(best, line)], settings.workers, self.evidence)
         done = replace(trial, fitted=hypothesis.with_posterior(), completed=True)
-        reasons = reasons_against(model, done.fitted, done.effect)
-        covers_zero = hypothesis.covers_zero(model.term(done.effect))
-        if covers_zero:
-            reasons.append("its strength cannot be told from zero: another grid or start changes it by as much")
-        return replace(done, impossible=tuple(reasons), covers_zero=covers_zero), line
+        return replace(done, impossible=tuple(reasons_against(model, done.fitted, done.effect))), line
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ class Trial:
     """An effect that was fitted through the rollout. impossible: why it cannot act as fitted, or cannot be told from a
     simpler one. converged: False if the fit did not reach what the ranking promised: that says nothing against the
     effect. log_bayes_factor: of its model against the best one with an effect fewer; None if it was not worked out.
-    not_weighed: why it could not be worked out. completed: it was fitted to the end, its places free if that pays.
-    covers_zero: and its strength cannot be told from zero."""
+    not_weighed: why it could not be worked out. completed: it was fitted to the end, its places free if that pays."""
 
     candidate: Candidate
     fitted: ModelFit
@@ -29,7 +28,6 @@ class Trial:
     log_bayes_factor: float | None = None
     not_weighed: str | None = None
     completed: bool = False
-    covers_zero: bool = False
 
     @property
     def effect(self) -> str:

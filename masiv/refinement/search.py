@@ -132,7 +132,7 @@ def _add_effects(
     rounds: list[Round] = []
     bases = list(laws)
     while len(rounds) < settings.max_effects:
-        done = run_round(state, bases, settings)
+        done = run_round(state, bases, settings, _places(rounds[0]) if rounds else {})
         rounds.append(done)
         if done.accepted is None:
             # Standard errors are those of the posterior; the model is the one that the last round confirmed.
@@ -142,7 +142,7 @@ def _add_effects(
         settings.progress("refine: fit whitened residuals", 1, 1, "")
         state, exchanges = with_exchanges(state, _places(rounds[0]), settings)
         if exchanges:
-            rounds[-1], rivals = replace(done, exchanges=exchanges), []
+            rounds[-1], rivals = replace(done, exchanges=(*done.exchanges, *exchanges)), []
         bases = [state.fit, *rivals]
     return state, rounds
 
@@ -173,10 +173,8 @@ def _overlooked(rounds: Sequence[Round], limits: Sequence[UpperLimit], settings:
 
 
 def _weighed_effects(rounds: Sequence[Round]) -> set[str]:
-    """Effects whose refit reached what the ranking promised and has an evidence, or a strength like zero: only these
-    can be told not to act."""
-    trials = [t for r in rounds for t in r.trials if t.converged]
-    return {t.effect for t in trials if t.covers_zero or t.log_bayes_factor is not None}
+    """Effects whose refit reached what the ranking promised and has an evidence: only these can be told not to act."""
+    return {t.effect for r in rounds for t in r.trials if t.converged and t.log_bayes_factor is not None}
 
 
 def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperLimit]) -> float:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 from masiv.inference.model_fit import (
     ModelFit,
     common_samples,
 )
 from masiv.refinement.candidates import Ranking
+from masiv.refinement.exchange import with_exchanges
 from masiv.refinement.hypotheses import (
     NEGLIGIBLE,
     Posterior,
@@ -24,9 +26,12 @@ MOST_COMPLETED = 4
 """Effects of a round that are fitted to the end before they are judged."""
 
 
-def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSettings) -> Round:
+def run_round(
+    state: SearchState, bases: Sequence[ModelFit], settings: SearchSettings,
+    places: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
+) -> Round:  # fmt: skip
     """Add one effect to ``state.fit``. bases: fits without that effect to start from, the first to be ranked in
-    full."""
+    full. places: where effects are tried in exchange for those of ``state.fit``."""
     attempts = try_effects(state, bases, settings)
     trials, current = rank_trials(attempts.trials), state.fit
     if trials:
@@ -43,7 +48,7 @@ def run_round(state: SearchState, bases: Sequence[ModelFit], settings: SearchSet
         )
         for t in trials
     ]
-    return _judged(state.with_fit(current), bases, trials, replace(attempts, ranking=ranking), settings)
+    return _judged(state.with_fit(current), bases, trials, replace(attempts, ranking=ranking), settings, places)
 
 
 def _with_inapplicable(state: SearchState, ranking: Ranking, settings: SearchSettings) -> Ranking:
@@ -56,10 +61,11 @@ def _with_inapplicable(state: SearchState, ranking: Ranking, settings: SearchSet
 
 def _judged(
     state: SearchState, bases: Sequence[ModelFit], trials: Sequence[Trial], attempts: Attempts,
-    settings: SearchSettings,
+    settings: SearchSettings, places: Mapping[str, Mapping[str, float]],
 ) -> Round:  # fmt: skip
     """The round with the posterior over the models without (``bases``) and with one effect more (``trials``). What may
-    act is fitted to the end before it is judged, and models are weighed at the mean of their posterior."""
+    act is fitted to the end before it is judged, and models are weighed at the mean of their posterior. If no effect is
+    named, those that were named before are exchanged in the most probable model with one more, if that may hold."""
     without, fewer = [state.fit, *bases[1:]], len(state.fit.model.effects)
     judged = RoundPosterior.of(state, without, trials, settings)
     for _ in range(MOST_COMPLETED):
@@ -71,10 +77,20 @@ def _judged(
     while trial is not None and not trial.completed and _named(judged.posterior, fewer, settings):
         judged = judged.with_completed(state, without, trial, settings)
         trial = _most_probable(judged.posterior, judged.trials, fewer)
-    named = trial is not None and _named(judged.posterior, fewer, settings)
+    named, exchanges = trial is not None and _named(judged.posterior, fewer, settings), ()
+    if trial is not None and not named and frozenset(trial.fitted.model.effects) in judged.posterior.credible_set():
+        other, exchanges = with_exchanges(state.with_fit(trial.fitted), places, settings)
+        if exchanges:
+            judged = judged.with_trial(state, without, replace(trial, fitted=other.fit, impossible=()), settings)
+            trial = _most_probable(judged.posterior, judged.trials, fewer)
+            named = trial is not None and trial.fitted is other.fit and _named(judged.posterior, fewer, settings)
     current = judged.posterior.best(fewer)
     base = current.with_posterior() if current is not None else state.fit
-    return Round(base, attempts.ranking, judged.trials, trial if named else None, judged.posterior, attempts.failures)
+    accepted = trial if named else None
+    return Round(
+        base, attempts.ranking, judged.trials, accepted, judged.posterior, attempts.failures,
+        exchanges if named else (),
+    )  # fmt: skip
 
 
 def _named(posterior: Posterior, fewer: int, settings: SearchSettings) -> bool:
