@@ -385,6 +385,15 @@ def test_what_was_accepted_first_is_exchanged_once_the_others_are_known():
     assert "exchanged quadratic drag for linear drag" in text(written)
 
 
+def test_what_cannot_act_beside_another_effect_is_tried_in_its_place():
+    """Two contacts with the ground, for instance: the wrong one was named while another effect was missing."""
+    patterns = {n: EFFECTS[n] for n in ("linear_drag", "gravity_scale")}
+    patterns["quadratic_drag"] = EFFECTS["linear_drag"] + 0.7 * EFFECTS["gravity_scale"] + 0.02 * EFFECTS["viscosity"]
+    truth = {"linear_drag.strength": 0.5, "gravity_scale.strength": 0.4}
+    model = LinearModel(truth, effects=patterns, exclusive=("linear_drag", "quadratic_drag"))
+    assert {t.name for t in refined(model).accepted} == {"linear_drag", "gravity_scale"}
+
+
 class Saturating(LinearModel):
     """A strength s acts as s / (1 + |s| / 2): at zero it seems to do more than it does."""
 

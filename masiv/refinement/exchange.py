@@ -81,7 +81,8 @@ def _best_exchange(
     except NonFiniteError:  # a round can do without the derivatives of its base, an exchange cannot
         return None
     fits = {}
-    for old, new, values in _probable(state, line, places, settings, gone)[:FITTED]:
+    probable = _probable(state, line, places, settings, gone)[:FITTED]
+    for old, new, values in (*_excluded(state, places, settings, gone), *probable):
         other = _without(here.model, old).with_effect(new)
         held = held_parameters(model, here) | {p.name for p in model.term(new).others}
         fits[old, new] = other, values, frozenset(name for name in held if name in values)
@@ -144,6 +145,25 @@ def _probable(
                 values = Hypothesis(here, joined, marginal).mean_values(columns[0])
                 out.append((marginal.log_evidence, old.name, name, _of(model, rest.model.with_effect(name), values)))
     return [row[1:] for row in sorted(out, key=lambda row: -row[0])]
+
+
+def _excluded(
+    state: SearchState, places: Mapping[str, Mapping[str, float]], settings: SearchSettings, gone: set[str]
+) -> list[tuple[str, str, dict[str, float]]]:
+    """Exchanges (old, new, values to start from) for what can act only without the old effect, such as another contact
+    with the ground: it has no linear model beside it."""
+    model, here = state.forward_model, state.fit
+    beside = {*here.model.effects, *settings.considered(model, here.model), *gone}
+    out = []
+    for old in here.model.effects[:-1]:
+        rest = _without(here.model, old)
+        for new in settings.considered(model, rest):
+            if new in beside or new not in places or model.term(old).replaces_parameter:
+                continue
+            start = {**places[new], **here.values}
+            parameters = model.parameters(rest.with_effect(new))
+            out.append((old, new, {p.name: start.get(p.name, p.start) for p in parameters}))
+    return out
 
 
 def _of(forward_model: ForwardModel, model: Model, values: Mapping[str, float]) -> dict[str, float]:
