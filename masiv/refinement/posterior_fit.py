@@ -16,6 +16,7 @@ from masiv.errors import NonFiniteError
 from masiv.inference.error_model import ErrorModel
 from masiv.inference.evidence import Evidence
 from masiv.inference.linear_model import LinearModel
+from masiv.inference.marginal_likelihood import Marginal
 from masiv.inference.model_fit import ModelFit, evaluate_fit
 from masiv.models.base import ForwardModel
 from masiv.refinement.hypotheses import Hypothesis, Linearizations
@@ -63,7 +64,7 @@ def linearized_at_mean(
         if moved is None:
             break
         try:
-            here = _Point.of(forward_model, moved, linearizations, evidence)
+            here = _Point.of(forward_model, moved, linearizations, evidence, here.hypothesis.marginal)
         except NonFiniteError:
             break
     return here.hypothesis.linear
@@ -88,13 +89,14 @@ class _Point:
     @classmethod
     def of(
         cls, forward_model: ForwardModel, fitted: ModelFit, linearizations: Linearizations,
-        evidence: Evidence | None = None,
+        evidence: Evidence | None = None, near: Marginal | None = None,
     ) -> _Point:  # fmt: skip
-        """evidence: with other errors than those that ``fitted`` leaves. Raises NonFiniteError."""
+        """evidence: with other errors than those that ``fitted`` leaves. near: of a point nearby, with this evidence.
+        Raises NonFiniteError."""
         line = linearizations.of(forward_model, fitted)
         evidence = evidence or Evidence.of(forward_model.observations, line.fields)
         terms = [forward_model.term(n) for n in fitted.model.effects]
-        return cls(evidence, Hypothesis(fitted, line, evidence.marginal(line, terms)))
+        return cls(evidence, Hypothesis(fitted, line, evidence.marginal(line, terms, near=near)))
 
     def stepped(
         self, forward_model: ForwardModel, robust_scale: float, allowed: Callable[[ModelFit], bool] = _any

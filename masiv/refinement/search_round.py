@@ -81,9 +81,11 @@ def _judged(
     if trial is not None and not named and frozenset(trial.fitted.model.effects) in judged.posterior.credible_set():
         other, exchanges = with_exchanges(state.with_fit(trial.fitted), places, settings)
         if exchanges:
-            judged = judged.with_trial(state, without, replace(trial, fitted=other.fit, impossible=()), settings)
+            exchanged = replace(trial, fitted=other.fit, impossible=(), completed=True)
+            judged = judged.with_ended(state, without, exchanged, judged.trials, settings)
             trial = _most_probable(judged.posterior, judged.trials, fewer)
-            named = trial is not None and trial.fitted is other.fit and _named(judged.posterior, fewer, settings)
+            exchanged_is_best = trial is not None and trial.fitted.values == other.fit.values
+            named = exchanged_is_best and _named(judged.posterior, fewer, settings)
     current = judged.posterior.best(fewer)
     base = current.with_posterior() if current is not None else state.fit
     accepted = trial if named else None
