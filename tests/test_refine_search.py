@@ -394,6 +394,14 @@ def test_what_cannot_act_beside_another_effect_is_tried_in_its_place():
     assert {t.name for t in refined(model).accepted} == {"linear_drag", "gravity_scale"}
 
 
+def test_the_search_goes_on_with_what_the_ranking_had_overlooked():
+    """Neither effect explains enough of the residual for a fit, as the other one is missing; their limits show one."""
+    model = LinearModel({**DRAG, **GRAVITY})
+    result = refined(model, {"min_explained": 0.9})
+    assert result.search.rounds[0].accepted is None
+    assert {t.name for t in result.accepted} == {"linear_drag", "gravity_scale"}
+
+
 class Saturating(LinearModel):
     """A strength s acts as s / (1 + |s| / 2): at zero it seems to do more than it does."""
 

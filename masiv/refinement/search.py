@@ -52,9 +52,15 @@ def search_effects(
     before = posterior_fit(start.forward_model, before, start.robust_scale, settings.linearizations)
     after, limits = _settled(state, before, rounds, settings)
     overlooked = [state.forward_model.term(name).effect for name in _overlooked(rounds, limits, settings)]
-    if overlooked and len(after.model.effects) < len(before.model.effects) + settings.max_effects:
-        state, more = _add_effects(state.with_fit(after), [after], settings.for_effects(overlooked))
+    left = settings.max_effects - (len(after.model.effects) - len(before.model.effects))
+    if overlooked and left > 0:
+        state, more = _add_effects(
+            state.with_fit(after), [after], replace(settings.for_effects(overlooked), max_effects=1)
+        )
         rounds += more
+        if more[-1].accepted is not None and left > 1:  # with what was overlooked, others may be probable
+            state, rest = _add_effects(state, [state.fit], replace(settings, max_effects=left - 1))
+            rounds += rest
         after, limits = _settled(state, before, rounds, settings)
     checked = {"before": _check(start, before, settings)}
     checked["after"] = checked["before"] if after is before else _check(state, after, settings)
