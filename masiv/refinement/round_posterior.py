@@ -149,6 +149,8 @@ def _linearized(
     state: SearchState, fits: Sequence[ModelFit], settings: SearchSettings
 ) -> tuple[list[Linearized], dict[int, str]]:
     """``fits`` with their derivatives over all instants; of those that have none, by their id, why not."""
+    if not fits:
+        return [], {}
     label, kept, failed = "refine: weigh models", [], {}
     settings.progress(label, 0, len(fits))
     for done, (fit, line) in enumerate(zip(fits, settings.linearizations.each(state.forward_model, fits), strict=True)):
