@@ -179,8 +179,10 @@ def _overlooked(rounds: Sequence[Round], limits: Sequence[UpperLimit], settings:
 
 
 def _weighed_effects(rounds: Sequence[Round]) -> set[str]:
-    """Effects whose refit reached what the ranking promised and has an evidence: only these can be told not to act."""
-    return {t.effect for r in rounds for t in r.trials if t.converged and t.log_bayes_factor is not None}
+    """Effects whose refit reached what the ranking promised and has an evidence, or cannot act: only these can be told
+    not to act."""
+    trials = [t for r in rounds for t in r.trials if t.converged]
+    return {t.effect for t in trials if t.impossible or t.log_bayes_factor is not None}
 
 
 def _with_unfitted(null: float, rounds: Sequence[Round], limits: Sequence[UpperLimit]) -> float:
