@@ -7,13 +7,13 @@ added to the model with a factor that is fitted (deferred correction with a free
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from masiv.inference.model_fit import ModelFit
+from masiv.inference.noise_model import one_more
 from masiv.models.base import ForwardModel
 from masiv.models.free_body import GRID_CORRECTION
 from masiv.observations.base import Observation
@@ -37,7 +37,7 @@ def with_residual_std(
         )
     mean = [np.mean(own, axis=0) for own in changes]
     kept = [_not_absorbed(observations, fitted, observation_std, each, mean) for each in zip(*changes, strict=True)]
-    more = _one_more(len(kept))
+    more = one_more(len(kept))
     out = []
     for k, (e, seen) in enumerate(zip(observations, observation_std, strict=True)):
         whole = np.sqrt(np.mean([_size(change) ** 2 for change in changes[k]], axis=0))
@@ -45,11 +45,6 @@ def with_residual_std(
         std = np.hypot(seen, np.maximum.accumulate(grid))
         out.append(replace(e, residual_std=std, grid_corrections=tuple(changes[k])))
     return forward_model.with_observations(out)
-
-
-def _one_more(count: int) -> float:
-    """By how many times more one more draw differs from the mean of ``count`` than these do."""
-    return math.sqrt((count + 1) / (count - 1))
 
 
 def _size(field: np.ndarray) -> np.ndarray:

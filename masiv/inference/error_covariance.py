@@ -90,25 +90,27 @@ class BlockCovariance:
         self._smooth = np.outer(block.smooth, block.smooth)
         self._nugget = NUGGET * np.eye(len(block.lags))
         self._grid = np.outer(block.grid, block.grid) * (matern52(block.lags / block.grid_length) + self._nugget)
-        rough = np.zeros(len(block.lags)) if block.grid_jitter is None else block.grid_jitter
-        self._rough = np.diag(rough**2)
+        jitter = np.zeros(len(block.lags)) if block.grid_jitter is None else block.grid_jitter
+        self._grid_jitter = np.diag(jitter**2)
 
     def _parts(self, logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         values, groups, g = np.exp(logs), len(logs) // 3, self.block.group
         smooth = values[groups + g] ** 2 * self._smooth
         jitter = float(self.block.jitter * values[g]) ** 2
-        return jitter, smooth, values[-2] ** 2 * self._grid, values[-1] ** 2 * self._rough
+        return jitter, smooth, values[-2] ** 2 * self._grid, values[-1] ** 2 * self._grid_jitter
 
     def _distance(self, logs: np.ndarray) -> np.ndarray:
         return self.block.lags / np.exp(logs[2 * (len(logs) // 3) + self.block.group])
 
     def __call__(self, logs: np.ndarray) -> np.ndarray:
-        jitter, smooth, grid, rough = self._parts(logs)
-        return jitter * np.eye(len(grid)) + smooth * (matern52(self._distance(logs)) + self._nugget) + grid + rough
+        jitter, smooth, grid, grid_jitter = self._parts(logs)
+        return (
+            jitter * np.eye(len(grid)) + smooth * (matern52(self._distance(logs)) + self._nugget) + grid + grid_jitter
+        )
 
     def gradient(self, logs: np.ndarray, by_covariance: np.ndarray) -> np.ndarray:
         """Gradient (3 G + 2,) of a function by the logarithms, from that by C (T, T)."""
-        jitter, smooth, grid, rough = self._parts(logs)
+        jitter, smooth, grid, grid_jitter = self._parts(logs)
         distance = self._distance(logs)
         groups, g = len(logs) // 3, self.block.group
         out = np.zeros(len(logs))
@@ -116,5 +118,5 @@ class BlockCovariance:
         out[groups + g] = 2 * float((by_covariance * smooth * (matern52(distance) + self._nugget)).sum())
         out[2 * groups + g] = float((by_covariance * smooth * matern52_by_log_length(distance)).sum())
         out[-2] = 2 * float((by_covariance * grid).sum())
-        out[-1] = 2 * float((by_covariance * rough).sum())
+        out[-1] = 2 * float((by_covariance * grid_jitter).sum())
         return out

@@ -21,6 +21,11 @@ MAX_POINTS, DISTANCE_BINS = 400, 24
 """Points, and bins of their distances, of which ``effective_samples`` takes the correlation."""
 
 
+def one_more(count: int) -> float:
+    """By how many times more one more draw differs from the mean of ``count`` than these do, root mean square."""
+    return math.sqrt((count + 1) / (count - 1))
+
+
 @dataclass(frozen=True)
 class RegimeMeans:
     """Means over fitted instants of a quantity over its variance. None: no instant is of that regime."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from masiv.inference.error_covariance import ErrorBlock
 from masiv.inference.motion_modes import MotionModes, rotations_since_start
-from masiv.inference.noise_model import OBSERVATION_LIMITED_RATIO
+from masiv.inference.noise_model import OBSERVATION_LIMITED_RATIO, one_more
 from masiv.observations.base import Observation
 
 MIN_TURNED_POINTS = 4
@@ -191,12 +191,7 @@ def _one_more(grids: np.ndarray) -> np.ndarray:
     count = len(grids)
     if count == 0:
         return np.zeros(grids.shape[1])
-    return _more(count) * np.maximum.accumulate(np.sqrt((grids**2).mean(2).mean(0)))
-
-
-def _more(count: int) -> float:
-    """By how many times more one more draw differs from the mean of ``count`` than these do."""
-    return math.sqrt((count + 1) / (count - 1))
+    return one_more(count) * np.maximum.accumulate(np.sqrt((grids**2).mean(2).mean(0)))
 
 
 def jitter_of_grids(grids: np.ndarray) -> np.ndarray:
@@ -207,4 +202,4 @@ def jitter_of_grids(grids: np.ndarray) -> np.ndarray:
         return np.zeros(instants)
     squares = (np.diff(grids, DIFFERENCES, axis=1) ** 2).mean((0, 2)) / DIFFERENCE_VARIANCE
     windows = np.convolve(squares, np.ones(DIFFERENCES + 1))
-    return _more(count) * np.sqrt(windows / np.convolve(np.ones(len(squares)), np.ones(DIFFERENCES + 1)))
+    return one_more(count) * np.sqrt(windows / np.convolve(np.ones(len(squares)), np.ones(DIFFERENCES + 1)))

@@ -23,7 +23,9 @@ from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.trials import Attempts, converged, try_effects
 
 MOST_COMPLETED = 4
-"""Effects of a round that are fitted to the end before they are judged."""
+"""Effects of a round that are fitted to the end before they are judged. Chosen."""
+AS_GOOD = 2 * NEGLIGIBLE
+"""Difference of the information criterion, twice that of log probabilities, up to which a fit is as good as another."""
 
 
 def run_round(
@@ -105,12 +107,13 @@ def _to_be_completed(posterior: Posterior, trials: Sequence[Trial], fewer: int) 
     first = _most_probable(posterior, trials, fewer)
     if first is not None and not first.completed and frozenset(first.fitted.model.effects) in posterior.credible_set():
         return first
-    possible = [t for t in trials if t.log_bayes_factor is not None and not t.impossible]
-    if max((t.log_bayes_factor for t in possible if t.log_bayes_factor is not None), default=0.0) < -NEGLIGIBLE:
+    weighed = {id(t): t.log_bayes_factor for t in trials if t.log_bayes_factor is not None and not t.impossible}
+    if not weighed or max(weighed.values()) < -NEGLIGIBLE:
         return None
-    samples = common_samples([t.fitted for t in possible]) if possible else 0
-    best = min((t.fitted.bic(samples) for t in possible), default=0.0)
-    close = [t for t in possible if not t.completed and t.fitted.bic(samples) < best + 2 * NEGLIGIBLE]
+    possible = [t for t in trials if id(t) in weighed]
+    samples = common_samples([t.fitted for t in possible])
+    best = min(t.fitted.bic(samples) for t in possible)
+    close = [t for t in possible if not t.completed and t.fitted.bic(samples) < best + AS_GOOD]
     return min(close, key=lambda t: t.fitted.bic(samples), default=None)
 
 
