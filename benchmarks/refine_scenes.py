@@ -50,7 +50,7 @@ def measured(run, truth_file, second, given):
         if not recordings:
             opened.start()
             first = opened.config
-        recordings.append(recording_of(opened, quiet))
+        recordings.append(recording_of(opened, quiet, split_cameras=True))
     twin = load_identified(run)
     config = RefineConfig.model_validate({**first.refine.model_dump(), **given})
     start = twin.fit.get("start") or twin.fit.get("law")

@@ -36,10 +36,10 @@ class Segment:
 
     kept: instants (T,), of which the first ``decided`` take part in decisions and the rest is for the test; what is
     expected is found from the former alone. turned: see ``MotionModes.coefficients``. jitter (G,) [m]: expected jitter
-    of a coefficient; smooth (T,) [m]: expected smooth error of a point along an axis; grid: of each group, (T,) [m] by
-    which another grid may change a coefficient, and grid_jitter: the part of that which is independent from instant to
-    instant; grids: of each group, (S, T, K_g) [m] by which those that were tried differ from their mean; weights (G,):
-    powers of the likelihood of each group; first_group: number of groups of other kinds of segments.
+    of a coefficient; smooth: of each group, (T,) [m], the expected smooth error of a coefficient; grid: of each group,
+    (T,) [m] by which another grid may change a coefficient, and grid_jitter: the part of that which is independent from
+    instant to instant; grids: of each group, (S, T, K_g) [m] by which those that were tried differ from their mean;
+    weights (G,): powers of the likelihood of each group; first_group: number of groups of other kinds of segments.
     """
 
     index: int
@@ -49,7 +49,7 @@ class Segment:
     decided: int
     turned: np.ndarray | None
     jitter: tuple[float, ...]
-    smooth: np.ndarray
+    smooth: tuple[np.ndarray, ...]
     grid: tuple[np.ndarray, ...]
     grid_jitter: tuple[np.ndarray, ...]
     grids: tuple[np.ndarray, ...]
@@ -73,11 +73,10 @@ class Segment:
             turned = rotations_since_start(observation.points, positions[kept].astype(np.float64))
         grids = _grid_changes(observation, modes, kept, turned)
         grid, grid_jitter = tuple(map(_one_more, grids)), tuple(map(jitter_of_grids, grids))
-        known = observation.observation_std[kept] / math.sqrt(axes)
-        floor = float(known.min()) / math.sqrt(count)
+        floor = float(observation.observation_std[kept].min()) / math.sqrt(axes * count)
         known_turn = None if turned is None else turned[:decided]
         jitter = tuple(jitter_of(c) or floor for c in modes.coefficients(field[kept[:decided]], known_turn))
-        smooth = np.full(len(kept), jitter[0]) if count == 1 else known
+        smooth = _smooth_errors(observation, modes, kept, turned) if count > 1 else (np.full(len(kept), jitter[0]),)
         limited = observation.residual_std[kept] < OBSERVATION_LIMITED_RATIO * observation.noise_std
         split = len(kept) if limited.all() or not observation.grid_corrections else int(np.argmin(limited))
         out = []
@@ -89,7 +88,7 @@ class Segment:
             parts = modes.coefficients(field[kept[part][:count]], None if own is None else own[:count])
             out.append(
                 cls(
-                    index, observation, modes, kept[part], count, own, jitter, smooth[part],
+                    index, observation, modes, kept[part], count, own, jitter, tuple(s[part] for s in smooth),
                     tuple(g[part] for g in grid), tuple(g[part] for g in grid_jitter), tuple(g[:, part] for g in grids),
                     _weights(parts, together=late), len(modes.names) if late else 0,
                 )
@@ -105,12 +104,13 @@ class Segment:
         lags = np.abs(np.subtract.outer(times, times))
         residuals = self.modes.coefficients(field[kept], turned)
         jacobians = self.modes.coefficients(jacobian[kept], turned)
-        groups = len(self.modes.names)
-        motion = max(self.observation.extent / float(np.median(self.smooth)), 1.0)
+        widths = [basis.shape[1] for basis in self.modes.bases]
+        along_axis = np.sqrt(sum(k * s**2 for k, s in zip(widths, self.smooth, strict=True)) / self.modes.axes)
+        motion = max(self.observation.extent / float(np.median(along_axis)), 1.0)
         return [
             ErrorBlock(
                 residual, derivatives, lags, self.first_group + group, self.jitter[group],
-                self.smooth[part] * math.sqrt(self.modes.axes / (residual.shape[1] * groups)), self.grid[group][part],
+                self.smooth[group][part], self.grid[group][part],
                 GRID_CORRELATION * float(self.observation.times[-1]), self.weights[group], motion,
                 self.grids[group][:, part], self.grid_jitter[group][part],
             )
@@ -173,6 +173,20 @@ def jitter_of(residual: np.ndarray) -> float:
         return 0.0
     left = np.diff(residual, DIFFERENCES, axis=0)
     return math.sqrt(float(np.median(left**2)) / CHI2_MEDIAN / DIFFERENCE_VARIANCE)
+
+
+def _smooth_errors(
+    observation: Observation, modes: MotionModes, kept: np.ndarray, turned: np.ndarray | None
+) -> tuple[np.ndarray, ...]:
+    """Expected size (T,) [m] of the smooth error of a coefficient, of each group: that of the draw of errors which the
+    observation has, and its noise; it does not fall as time goes on. Without a draw each group has an equal share of
+    the expected error of the observation."""
+    shares = [1 / math.sqrt(basis.shape[1] * len(modes.bases)) for basis in modes.bases]
+    if observation.tracking_error is None:
+        return tuple(share * observation.observation_std[kept] for share in shares)
+    drawn = modes.coefficients(observation.tracking_error[kept], turned)
+    sizes = [np.maximum.accumulate(np.sqrt((d**2).mean(1))) for d in drawn]
+    return tuple(np.hypot(share * observation.noise_std, size) for share, size in zip(shares, sizes, strict=True))
 
 
 def _grid_changes(

@@ -18,7 +18,8 @@ class Observation:
     where the points are at the start, in the axes of ``values``. values (T, N, A) [m]: what was measured in A axes, NaN
     if it is missing. noise_std [m]: of the measurement. residual_std (T,) [m]: by how much a model that lacks nothing
     may differ from it. observation_std (T,) [m]: the part of that which is measurement; ``residual_std`` itself if not
-    given. grid_corrections, each (T, N, A) [m]: what each finer grid changes along the motion of a model;
+    given. tracking_error (T, N, A) [m]: one draw of the error of following the points, None if there is none.
+    grid_corrections, each (T, N, A) [m]: what each finer grid changes along the motion of a model;
     empty if that is not known. ``dataclasses.replace`` gives an observation another noise or split.
 
     Raises ValueError for shapes that do not fit together.
@@ -32,19 +33,21 @@ class Observation:
     noise_std: float
     residual_std: np.ndarray
     observation_std: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    tracking_error: np.ndarray | None = None
     grid_corrections: tuple[np.ndarray, ...] = ()
     test_count: int = 0
 
     def __post_init__(self) -> None:
         if not len(self.observation_std):
             object.__setattr__(self, "observation_std", self.residual_std)
-        instants, count, axes = self.values.shape
+        instants, count, _ = self.values.shape
         expected = {
             "times": (self.times, (instants,)),
             "points": (self.points, (count, 3)),
             "residual_std": (self.residual_std, (instants,)),
             "observation_std": (self.observation_std, (instants,)),
-            **{f"grid_corrections[{k}]": (c, (instants, count, axes)) for k, c in enumerate(self.grid_corrections)},
+            **{f"grid_corrections[{k}]": (c, self.values.shape) for k, c in enumerate(self.grid_corrections)},
+            **({} if self.tracking_error is None else {"tracking_error": (self.tracking_error, self.values.shape)}),
         }
         for name, (array, shape) in expected.items():
             if array.shape != shape:

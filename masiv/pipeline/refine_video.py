@@ -33,7 +33,7 @@ def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Prog
     from masiv.twin.identified import load_identified
 
     first = runs[0]
-    recordings = [recording_of(run, progress) for run in runs]
+    recordings = [recording_of(run, progress, split_cameras=not request.dry_run) for run in runs]
     particles = max(r.motion.positions.shape[1] for r in recordings)
     memory = expected_memory("refine", recordings[0].scene, first.config, particles)
     memory.announce(first.config.memory_limit_mb, progress)
@@ -54,14 +54,16 @@ def refine_runs(runs: Sequence[VideoRun], request: RefineRequest, progress: Prog
     return Summary({"refine": str(first.path / "refine.json"), **document}, text(document))
 
 
-def recording_of(run: VideoRun, progress: Progress) -> Recording:
-    """The motion of a run: fitted frames, and held-out frames measured in a pass of their own."""
+def recording_of(run: VideoRun, progress: Progress, *, split_cameras: bool) -> Recording:
+    """The motion of a run: fitted frames, and held-out frames measured in a pass of their own; with ``split_cameras``
+    the same from two sets of cameras, if the configuration asks for it."""
     from masiv.refinement.from_video import Recording, split_frames
 
     trajectory = stages.load_trajectory(run.folder)
     held_out = stages.ensure_held_out_trajectory(run.folder, run.config, run.scene, progress)
     fitted = split_frames(run.scene.frame_count, run.folder.fit_frames)
-    return Recording(run.path.resolve().name, run.scene, trajectory, held_out or trajectory, fitted)
+    split = stages.ensure_camera_split(run.folder, run.config, run.given_scene, progress) if split_cameras else None
+    return Recording(run.path.resolve().name, run.scene, trajectory, held_out or trajectory, fitted, split)
 
 
 def _save(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from masiv import runtime
 from masiv.config import Config
 from masiv.errors import InputError
+from masiv.files import atomic_folder
 from masiv.hull.first_frame import require_first_frame
 from masiv.observations.kept_masks import with_kept_masks
 from masiv.observations.read import read_scene
@@ -28,6 +29,7 @@ from masiv.strict import read_json
 if TYPE_CHECKING:
     import numpy as np
 
+    from masiv.continuum.camera_split import CameraSplit
     from masiv.continuum.trajectory import Trajectory
     from masiv.splat.dynamic import DynamicGaussians
     from masiv.twin import Twin
@@ -217,6 +219,46 @@ def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, pro
     trajectory.save(path)
     checkpoint.clear()
     return trajectory
+
+
+def ensure_camera_split(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> CameraSplit | None:
+    """All frames of ``scene``, whose cameras are those that were given, reconstructed from each half of its cameras;
+    None if ``config`` does not ask for it, or there are too few cameras. Made once: RUN/camera_split keeps it."""
+    from masiv.continuum.camera_split import CameraSplit, camera_halves
+    from masiv.splat.dynamic import DynamicGaussians
+    from masiv.splat.reconstruct import reconstruct
+
+    if not config.refine.camera_split or not scene.cameras:
+        return None
+    visible = scene.restricted(holdout_cameras=run.holdout_cameras)
+    centre = load_gaussians(run).canonical.means.mean(dim=0).double().numpy()
+    halves = camera_halves(visible, centre)
+    if halves is None:
+        return None
+    folders = [run.path / "camera_split" / str(k) for k in range(len(halves))]
+    for number, (folder, views) in enumerate(zip(folders, halves, strict=True), 1):
+        if folder.is_dir():
+            continue
+        runtime.start(config.arch)
+        others = tuple(view for view in visible.views if view not in views)
+        checkpoint = run.checkpoint("camera_split")
+
+        def told(stage: str, done: int, total: int, note: str = "", *, half: int = number) -> None:
+            progress(f"{stage}, half {half} of the cameras", done, total, note)
+
+        half = reconstruct(
+            visible.restricted(holdout_cameras=others),
+            config.reconstruct,
+            seed=config.seed,
+            checkpoint=checkpoint,
+            progress=told,
+        )
+        with atomic_folder(folder) as temporary:
+            half.save(temporary)
+        checkpoint.clear()
+        scene.release_pictures()
+    first, second = (DynamicGaussians.load(folder) for folder in folders)
+    return CameraSplit((first, second))
 
 
 @contextmanager

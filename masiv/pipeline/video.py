@@ -53,9 +53,11 @@ class VideoRun(Run):
     def scene(self) -> Scene:
         """All frames and cameras; after the reconstruct stage, the cameras that it refined. Raises InputError if the
         scene is not there or not the run's."""
-        return stages.calibrated_scene(self.folder, self._given_scene())
+        return stages.calibrated_scene(self.folder, self.given_scene)
 
-    def _given_scene(self) -> Scene:
+    @property
+    def given_scene(self) -> Scene:
+        """The same with the cameras as they were given."""
         if self._read is None:
             read = read_scene(self.existing_scene())
             self.folder.check_scene(identity(read), self.scene_path)
@@ -64,7 +66,7 @@ class VideoRun(Run):
 
     def request(self) -> Request:
         split = self.folder.fit_frames, self.folder.holdout_cameras
-        return Request(self.config.model_dump(mode="json"), self.scene_path, identity(self._given_scene()), *split)
+        return Request(self.config.model_dump(mode="json"), self.scene_path, identity(self.given_scene), *split)
 
     @classmethod
     def open(cls, scene: Path, out: Path, overrides: Overrides, request: SceneRequest) -> VideoRun:
@@ -110,7 +112,7 @@ class VideoRun(Run):
 
     def trajectory(self, progress: Progress = silent) -> Summary:
         self.start()
-        stages.require_memory(self.folder, self.config, self._given_scene(), "trajectory")
+        stages.require_memory(self.folder, self.config, self.given_scene, "trajectory")
         with self.changing():
             made = stages.ensure_trajectory(self.folder, self.config, self.scene, progress)
         frames, particles = made.positions.shape[:2]
@@ -145,7 +147,7 @@ class VideoRun(Run):
         from masiv.simulation.simulate import simulate
 
         folder = self.folder
-        stages.require_memory(folder, self.config, self._given_scene(), "identify")
+        stages.require_memory(folder, self.config, self.given_scene, "identify")
         dynamic = stages.ensure_gaussians(folder, self.config, self.scene, progress)
         scene = self.scene
         trajectory = stages.ensure_trajectory(folder, self.config, scene, progress)

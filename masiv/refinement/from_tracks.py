@@ -35,6 +35,7 @@ NOT_FOR_TRACKS = {
     "laws": "identify.law",
     "baseline_rollouts": "tracks.rollouts",
     "test_fraction": "the runs with `use: test`",
+    "camera_split": "the noise of the markers at rest",
     "tracking_error": "the noise of the markers at rest",
 }
 """Keys of refine that say nothing of tracks, and what holds for these."""

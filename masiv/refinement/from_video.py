@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from masiv import runtime
 from masiv.checkpoint import Checkpoint
+from masiv.continuum.camera_split import CameraSplit
 from masiv.identification.config import RENAMED_STARTS, IdentifyConfig
 from masiv.models.free_body import FreeBodyModel
 from masiv.mpm.config import SimulatorConfig
@@ -36,13 +37,15 @@ COMPETITORS = {
 @dataclass(frozen=True)
 class Recording:
     """A motion that was filmed, of which the first ``fit_frames`` frames may be fitted. motion: of those, or more;
-    whole: of all frames, of which only those after are taken."""
+    whole: of all frames, of which only those after are taken. camera_split: the same motion from two sets of cameras,
+    None if it is not known."""
 
     name: str
     scene: Scene
     motion: Observed
     whole: Observed
     fit_frames: int
+    camera_split: CameraSplit | None = None
 
 
 def split_frames(frame_count: int, fit_frames: int) -> int:
@@ -84,7 +87,16 @@ def refine_recordings(
         config = config.model_copy(update={"laws": list(COMPETITORS[start])})
     with runtime.torch_threads(1), workers_for(config.processes, config.scheduler) as workers:
         prepared = [
-            prepare(r.name, r.scene, first_frames(r.motion, r.fit_frames), r.whole, identify, simulator, config)
+            prepare(
+                r.name,
+                r.scene,
+                first_frames(r.motion, r.fit_frames),
+                r.whole,
+                identify,
+                simulator,
+                config,
+                camera_split=r.camera_split,
+            )
             for r in with_unique_names(recordings)
         ]
         forward_model = FreeBodyModel([setup for setup, *_ in prepared])

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import torch
 
+from masiv.continuum.camera_split import CameraSplit
 from masiv.identification.config import IdentifyConfig
 from masiv.identification.losses.objective import Objective
 from masiv.models.filmed_body import FilmedBody
@@ -41,11 +42,14 @@ def prepare(
     identify: IdentifyConfig,
     simulator: SimulatorConfig,
     config: RefineConfig,
+    *,
+    camera_split: CameraSplit | None = None,
 ) -> tuple[FreeBodySetup, Objective, Objective, InitialMotion]:
     """What ``FreeBodyModel`` needs of a recording; objectives of its fitted frames alone, on the same particles and on
     fewer; the estimate of the initial motion.
 
     fitted: the motion of the frames that may be fitted. whole: of all frames; only the later ones are taken from it.
+    camera_split: shows how well points were followed; without it, that is assumed (``config.tracking_error``).
     """
     count, samples = fitted.positions.shape[1], config.samples_per_frame
     on_coarse, on_coarser = (
@@ -70,21 +74,27 @@ def prepare(
         fitted.positions, fitted.times, scene.gravity, scene.ground, clearance=coarse.spacing
     )
     noise = max(noise_floor(fitted.positions, motion.last_frame), MIN_NOISE)
-    positions = torch.cat([body.particles[None], body.targets]).double().numpy()
-    lost = (
-        config.tracking_error * beyond_rigid(positions)
-        if scene.cameras or scene.load_cloud
-        else np.zeros(len(body.targets))
-    )
+    times = np.arange(1, len(body.targets) + 1) / (samples * scene.fps)
+    tracking_error = None
+    if camera_split is not None:
+        in_world = camera_split.tracking_error(fitted.positions[0][chosen], times)
+        tracking_error = body.axes.vectors_to_simulation(in_world)
+        lost = np.sqrt((tracking_error**2).sum(2).mean(1))
+    elif scene.cameras or scene.load_cloud:
+        positions = torch.cat([body.particles[None], body.targets]).double().numpy()
+        lost = config.tracking_error * beyond_rigid(positions)
+    else:
+        lost = np.zeros(len(times))
     observation = VideoObservation(
         name=name,
-        times=np.arange(1, len(body.targets) + 1) / (samples * scene.fps),
+        times=times,
         points=body.particles.double().numpy(),
         values=body.targets.numpy(),
         fit_count=(len(fitted.times) - 1) * samples,
         test_count=math.floor(config.test_fraction * (len(whole.times) - len(fitted.times))) * samples,
         noise_std=noise,
         residual_std=np.hypot(noise, np.maximum.accumulate(lost)),
+        tracking_error=tracking_error,
         samples_per_frame=samples,
         simulation_axes=body.axes,
     )
