@@ -109,16 +109,22 @@ def observation_of(points, tracking_error):
     )  # fmt: skip
 
 
-def test_expected_errors_of_a_group_are_those_of_the_draw():
+def test_expected_errors_of_a_group_are_at_least_those_of_the_draw():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(150, 3)) * 0.1
     draw = errors(rng, points)
-    (segment,) = Segment.of(0, observation_of(points, draw), draw)
-    modes = MotionModes.of(points, 3)
-    for coefficients, smooth in zip(modes.coefficients(draw), segment.smooth, strict=True):
-        wanted = np.maximum.accumulate(np.sqrt((coefficients**2).mean(1)))
-        np.testing.assert_allclose(smooth, wanted, rtol=0.02, atol=1e-4)
-        assert (np.diff(smooth) >= 0).all()
+    observation = observation_of(points, draw)
+    (segment,) = Segment.of(0, observation, draw)
+    (assumed,) = Segment.of(0, dataclasses.replace(observation, tracking_error=None), draw)
+    larger = []
+    for coefficients, smooth, share in zip(
+        segment.modes.coefficients(draw), segment.smooth, assumed.smooth, strict=True
+    ):
+        drawn = np.maximum.accumulate(np.sqrt((coefficients**2).mean(1)))
+        np.testing.assert_allclose(smooth, np.maximum(drawn, share), rtol=0.02)
+        larger.append(smooth[-1] > share[-1])
+    assert larger[0]  # the translation has most of this error
+    assert not all(larger)
 
 
 def test_without_a_draw_the_groups_share_the_expected_error():
@@ -132,9 +138,9 @@ def test_without_a_draw_the_groups_share_the_expected_error():
     np.testing.assert_allclose(np.sqrt(total), assumed.observation_std)
 
 
-def test_factors_on_the_measured_errors_are_about_one():
+def test_factor_on_the_measured_error_is_about_one():
     """What is left of a right model are errors of the same law as the draw: the factor that is most probable scatters
-    about 1 in every group, large and small ones alike."""
+    about 1 where the draw counts."""
     rng = np.random.default_rng(2)
     points = rng.normal(size=(60, 3)) * 0.1
     logs = []
@@ -142,9 +148,8 @@ def test_factors_on_the_measured_errors_are_about_one():
         segments = Segment.of(0, observation_of(points, errors(rng, points)), residual := errors(rng, points))
         blocks = [b for s in segments for b in s.blocks(residual, np.zeros((*residual.shape, 0)))]
         found = marginal(blocks, ParameterPriors(np.zeros(0), np.zeros((1, 0))), SizePriors.of(blocks))
-        logs.append(np.log(found.sizes.smooth))
-    median = np.median(logs, axis=0)
-    assert (np.abs(median) < 0.5).all(), np.exp(median)
+        logs.append(np.log(found.sizes.smooth[0]))
+    assert abs(np.median(logs)) < 0.4, np.exp(logs)
 
 
 def test_a_draw_of_another_shape_is_refused():
@@ -156,10 +161,11 @@ def test_a_draw_of_another_shape_is_refused():
 # -- a run ------------------------------------------------------------------------------------------------------------
 
 SETTINGS = Config(
+    refine=RefineConfig(camera_split=True),
     reconstruct=ReconstructConfig(
         gaussians=80, hull_resolution=12, crop_side=24, crop_padding=2, width=8, depth=1, space_octaves=1, iterations=8,
         processes=1, refine_calibration=False,
-    )
+    ),
 )  # fmt: skip
 
 

@@ -178,15 +178,15 @@ def jitter_of(residual: np.ndarray) -> float:
 def _smooth_errors(
     observation: Observation, modes: MotionModes, kept: np.ndarray, turned: np.ndarray | None
 ) -> tuple[np.ndarray, ...]:
-    """Expected size (T,) [m] of the smooth error of a coefficient, of each group: that of the draw of errors which the
-    observation has, and its noise; it does not fall as time goes on. Without a draw each group has an equal share of
-    the expected error of the observation."""
-    shares = [1 / math.sqrt(basis.shape[1] * len(modes.bases)) for basis in modes.bases]
+    """Expected size (T,) [m] of the smooth error of a coefficient, of each group: an equal share of the observation's
+    expected error, and no less than the draw of errors that it may have, which does not fall as time goes on."""
+    known = observation.observation_std[kept]
+    shares = tuple(known / math.sqrt(basis.shape[1] * len(modes.bases)) for basis in modes.bases)
     if observation.tracking_error is None:
-        return tuple(share * observation.observation_std[kept] for share in shares)
+        return shares
     drawn = modes.coefficients(observation.tracking_error[kept], turned)
     sizes = [np.maximum.accumulate(np.sqrt((d**2).mean(1))) for d in drawn]
-    return tuple(np.hypot(share * observation.noise_std, size) for share, size in zip(shares, sizes, strict=True))
+    return tuple(map(np.maximum, shares, sizes))
 
 
 def _grid_changes(

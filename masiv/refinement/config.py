@@ -58,15 +58,14 @@ class RefineConfig(BaseModel):
         description="part of the frames that are not fitted, the last ones, which no decision sees: errors before and "
         "after are reported on them",
     )  # fmt: skip
-    camera_split: bool = Field(
-        True,
-        description="the error of points that are followed in pictures is measured: two reconstructions, each from "
-        "half of the cameras; needs six cameras, and the time of the reconstruct stage twice",
-    )  # fmt: skip
     tracking_error: float = Field(
         0.4, ge=0, le=1,
-        description="error of points that are followed, over their distance from a rigid motion, where it is not "
-        "measured by camera_split",
+        description="error of points that are followed in pictures, over their distance from a rigid motion",
+    )  # fmt: skip
+    camera_split: bool = Field(
+        False,
+        description="that error is at least half the difference of two reconstructions, each from half of the cameras; "
+        "needs six cameras, and the time of the reconstruct stage twice",
     )  # fmt: skip
     min_explained: float = Field(
         0.1, ge=0, le=1, description="part of the residual that an effect must explain in the ranking to be fitted"

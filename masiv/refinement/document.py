@@ -38,7 +38,7 @@ def document(result: RefineResult) -> dict[str, Any]:
         "verdict": result.verdict,
         "noise_floor_mm": 1e3 * float(np.mean([e.noise_std for e in result.observations])),
         "observation_error_mm": _expected_mm(result, _observation_variance),
-        "tracking_error_measured": all(e.tracking_error is not None for e in result.observations),
+        "camera_split": all(e.tracking_error is not None for e in result.observations),
         "discretization_mm": _expected_mm(result, _discretization_variance),
         "grid_change": {"before": _grid_change(result, before), "after": _grid_change(result, after)},
         "reduced_chi": {"before": result.reduced_chi(before), "after": result.reduced_chi(after)},

@@ -31,10 +31,10 @@ def text(document: Mapping[str, Any]) -> str:
     """The document for a terminal."""
     shown = with_scopes(document)
     before, after = shown["before"], shown["after"]
-    measured = " (measured with two sets of cameras)" if shown.get("tracking_error_measured") else ""
+    compared = " (two sets of cameras were compared)" if shown.get("camera_split") else ""
     lines = [
         f"noise floor {shown['noise_floor_mm']:.1f} mm, expected error of the observation "
-        f"{shown['observation_error_mm']['fit'] or 0.0:.1f} mm{measured}, a finer grid would change "
+        f"{shown['observation_error_mm']['fit'] or 0.0:.1f} mm{compared}, a finer grid would change "
         f"{shown['discretization_mm']['fit'] or 0.0:.1f} mm; residual {shown['residual_mm']['fit']:.1f} mm fitted"
         + _validation(shown["residual_mm"]["validation"])
     ]

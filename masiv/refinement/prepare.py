@@ -49,7 +49,8 @@ def prepare(
     fewer; the estimate of the initial motion.
 
     fitted: the motion of the frames that may be fitted. whole: of all frames; only the later ones are taken from it.
-    camera_split: shows how well points were followed; without it, that is assumed (``config.tracking_error``).
+    camera_split: points were followed no better than it says; without it, what ``config.tracking_error`` says counts
+    alone.
     """
     count, samples = fitted.positions.shape[1], config.samples_per_frame
     on_coarse, on_coarser = (
@@ -75,16 +76,14 @@ def prepare(
     )
     noise = max(noise_floor(fitted.positions, motion.last_frame), MIN_NOISE)
     times = np.arange(1, len(body.targets) + 1) / (samples * scene.fps)
-    tracking_error = None
+    lost, tracking_error = np.zeros(len(times)), None
+    if scene.cameras or scene.load_cloud:
+        positions = torch.cat([body.particles[None], body.targets]).double().numpy()
+        lost = config.tracking_error * beyond_rigid(positions)
     if camera_split is not None:
         in_world = camera_split.tracking_error(fitted.positions[0][chosen], times)
         tracking_error = body.axes.vectors_to_simulation(in_world)
-        lost = np.sqrt((tracking_error**2).sum(2).mean(1))
-    elif scene.cameras or scene.load_cloud:
-        positions = torch.cat([body.particles[None], body.targets]).double().numpy()
-        lost = config.tracking_error * beyond_rigid(positions)
-    else:
-        lost = np.zeros(len(times))
+        lost = np.maximum(lost, np.sqrt((tracking_error**2).sum(2).mean(1)))
     observation = VideoObservation(
         name=name,
         times=times,
