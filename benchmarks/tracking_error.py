@@ -4,10 +4,14 @@ known.
     python benchmarks/tracking_error.py draw OUT --count 8
     masiv reconstruct OUT/NUMBER/scene --out OUT/NUMBER/run --preset quick
     masiv trajectory OUT/NUMBER/run --preset quick
+    python benchmarks/tracking_error.py split OUT
     python benchmarks/tracking_error.py measure OUT
 
-``measure`` prints, for each group of modes of motion, the factor on the size that refine expects of smooth errors,
-before the body has touched anything and after: the posterior mode under a prior that says next to nothing.
+A folder of OUT may be another scene with its truth: OUT/NAME/scene and OUT/NAME/run. ``split`` compares two sets of
+cameras of each (``refine.camera_split``); it takes twice the time of reconstruct. ``measure`` prints the error of the
+last frames in each group of modes, and what two sets of cameras say of it; and, for each group of modes of motion, the
+factor on the size that refine expects of smooth errors, before the body has touched anything and after: the posterior
+mode under a prior that says next to nothing.
 """
 
 from __future__ import annotations
@@ -126,10 +130,63 @@ def sizes_of(run: Path, scene: Path) -> tuple[list[str], np.ndarray, np.ndarray]
     return names, factors, added
 
 
+LAST = 4
+"""Frames over which errors are compared with the difference of two sets of cameras."""
+
+
+def compare(run: Path, scene: Path) -> None:
+    """Print root mean squares [mm] over the last frames: errors of all points, of the upper and the lower quarter of
+    the body, of each group of modes; of half the difference of two sets of cameras; and what refine assumes."""
+    from masiv.continuum.camera_split import CameraSplit
+    from masiv.inference.motion_modes import MotionModes, rotations_since_start
+    from masiv.refinement.config import RefineConfig
+    from masiv.rigid import beyond_rigid
+    from masiv.splat.dynamic import DynamicGaussians
+
+    times, seen, error = errors_of(run, scene)
+    modes, turned = MotionModes.of(seen[0], 3), rotations_since_start(seen[0], seen)
+
+    def by_group(field: np.ndarray) -> str:
+        parts = modes.coefficients(field, turned)
+        sizes = [1e3 * np.sqrt((c[-LAST:] ** 2).sum(1).mean()) for c in parts]
+        whole = 1e3 * np.sqrt((field[-LAST:] ** 2).sum(2).mean())
+        return f"{whole:.1f} mm (" + ", ".join(f"{n} {s:.1f}" for n, s in zip(modes.names, sizes, strict=True)) + ")"
+
+    height = seen[0][:, 1]
+    low, high = (
+        error[-LAST:, part] for part in (height < np.quantile(height, 0.25), height > np.quantile(height, 0.75))
+    )
+    print(f"{run.parent.name}: error {by_group(error)}; upper and lower quarter "
+          f"{1e3 * np.sqrt((high**2).sum(2).mean()):.1f}, {1e3 * np.sqrt((low**2).sum(2).mean()):.1f} mm; "
+          f"assumed {1e3 * RefineConfig().tracking_error * beyond_rigid(seen)[-LAST:].mean():.1f} mm")  # fmt: skip
+    halves = [run / "camera_split" / str(k) for k in range(2)]
+    if all(half.is_dir() for half in halves):
+        first, second = map(DynamicGaussians.load, halves)
+        print(f"{run.parent.name}: two sets {by_group(CameraSplit((first, second)).tracking_error(seen[0], times))}")
+
+
+def split(out: Path) -> None:
+    from masiv import runtime
+    from masiv.pipeline import reopen_run
+    from masiv.pipeline.stages import ensure_camera_split
+    from masiv.pipeline.video import VideoRun
+    from masiv.progress import silent
+    from masiv.refinement.config import RefineConfig
+
+    runtime.start("cpu")
+    for folder in sorted(f for f in out.iterdir() if (f / "run" / "trajectory.npz").is_file()):
+        run = reopen_run(folder / "run", require="trajectory")
+        assert isinstance(run, VideoRun)
+        config = run.config.model_copy(update={"refine": RefineConfig(camera_split=True)})
+        ensure_camera_split(run.folder, config, run.given_scene, silent)
+        print(f"{folder.name}: compared", flush=True)
+
+
 def measure(out: Path) -> None:
     rows = []
     followed = (f for f in out.iterdir() if (f / "run" / "trajectory.npz").is_file())
-    for folder in sorted(followed, key=lambda f: int(f.name)):
+    for folder in sorted(followed, key=lambda f: f.name):
+        compare(folder / "run", folder / "scene")
         names, factors, added = sizes_of(folder / "run", folder / "scene")
         rows.append(np.log(factors))
         flight, contact = np.split(factors, 2)
@@ -143,13 +200,15 @@ def measure(out: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["draw", "measure"])
+    parser.add_argument("what", choices=["draw", "split", "measure"])
     parser.add_argument("out", type=Path)
     parser.add_argument("--count", type=int, default=8)
     parser.add_argument("--first", type=int, default=0)
     given = parser.parse_args()
     if given.what == "draw":
         draw(given.out, given.count, given.first)
+    elif given.what == "split":
+        split(given.out)
     else:
         measure(given.out)
 
