@@ -110,9 +110,8 @@ def probability_below(evidence, line, term, index, offset) -> np.ndarray:
         highest = max(log for log, _, _ in components)
         for log, mean, covariance in components:
             m, s = (priors.mean + mean)[index], np.sqrt(np.diag(covariance)[index])
-            floor = -np.inf
-            if priors.positive is not None:
-                floor = (priors.mean[index] - m) / s  # strength zero
+            zero = (priors.mean[index] - m) / s
+            floor = np.where(np.isin(index, priors.positive), zero, -np.inf)
             weight = np.exp(log - highest)
             below += weight * np.maximum(ndtr((offset - m) / s) - ndtr(floor), 0)
             total += weight * (1 - ndtr(floor))

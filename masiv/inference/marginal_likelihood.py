@@ -253,11 +253,22 @@ def marginal(
     hessian = _hessian(likelihood.objective, logs, sizes.sd)
     # Volume of the posterior of the sizes over that of their prior.
     volume = -0.5 * np.linalg.slogdet(hessian * np.outer(sizes.sd, sizes.sd))[1]
+    return replace(_given_sizes(likelihood, logs), log_evidence=-float(found.fun) + float(volume))
+
+
+def marginal_of_sizes(blocks: Sequence[ErrorBlock], priors: ParameterPriors, logs: np.ndarray) -> Marginal:
+    """The same if the sizes of the errors are known: ``logs`` are their logarithms (3 G + 2,)."""
+    return _given_sizes(_Likelihood(blocks, priors, SizePriors.of(blocks)), logs)
+
+
+def _given_sizes(likelihood: _Likelihood, logs: np.ndarray) -> Marginal:
     terms = likelihood.terms(logs)
-    weights = np.exp(terms.logp - np.logaddexp.reduce(terms.logp))
+    log_evidence = float(np.logaddexp.reduce(terms.logp))
+    weights = np.exp(terms.logp - log_evidence)
     mean, spread = _moments(weights, terms.mean, terms.covariance)
     spread = spread + likelihood.by_another_grid(logs, np.tensordot(weights, terms.covariance, 1))
-    return Marginal(-float(found.fun) + float(volume), priors.mean + mean, spread, logs)
+    log_evidence -= math.log(len(terms.logp))
+    return Marginal(log_evidence, likelihood.priors.mean + mean, spread, logs)
 
 
 def _moments(weights: np.ndarray, means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

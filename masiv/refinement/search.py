@@ -17,7 +17,7 @@ from masiv.refinement.discrepancy import discrepancy_force
 from masiv.refinement.effect_fit import BROYDEN_STEPS
 from masiv.refinement.exchange import with_exchanges
 from masiv.refinement.hypotheses import log_prior
-from masiv.refinement.limits import UpperLimit, limit_of_fit, sensitivity, upper_limit
+from masiv.refinement.limits import UpperLimit, limit_of_fit, places_to_limit, sensitivities, upper_limit
 from masiv.refinement.posterior_fit import posterior_fit
 from masiv.refinement.rounds import Check, Round, SearchResult
 from masiv.refinement.search_round import run_round
@@ -224,8 +224,8 @@ def _check(state: SearchState, fitted: ModelFit, settings: SearchSettings) -> Ch
 
 
 def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchSettings) -> list[UpperLimit]:
-    """Of all effects that could act in addition to ``state.fit``, at the places where the first ranking saw them; of
-    those in the last credible set, not below what their own fits allow."""
+    """Of all effects that could act in addition to ``state.fit``, wherever they may act; their Bayes factors are of the
+    places where the first ranking saw them. Of those in the last credible set, not below what their own fits allow."""
     model, fitted = state.forward_model, state.fit
     names = settings.considered(model, fitted.model)
     places = _places(rounds[0]) if rounds else {}
@@ -236,9 +236,11 @@ def _upper_limits(state: SearchState, rounds: Sequence[Round], settings: SearchS
     label = "refine: upper limits"
     settings.progress(label, 0, len(names))
     out = []
-    tasks = [(line, name, places.get(name, {})) for name in names]
+    tasks = [
+        (line, name, places_to_limit(model.term(name), places.get(name, {}), model.observations)) for name in names
+    ]
     for done, (name, found) in enumerate(
-        zip(names, map_tasks(settings.workers, model, sensitivity, tasks), strict=True)
+        zip(names, map_tasks(settings.workers, model, sensitivities, tasks), strict=True)
     ):
         settings.progress(label, done + 1, len(names), name)
         if isinstance(found, TaskError):
