@@ -377,4 +377,4 @@ def test_evidence_by_derivatives_of_the_model_without_an_effect_is_exact_if_moti
     assert [p.name for p in rough.parameters] == [p.name for p in exact.parameters]
     np.testing.assert_allclose(rough.jacobians[0], exact.jacobians[0], atol=1e-9)
     one, other = (weighed(model, [(fit, line)])[0].marginal.log_evidence for line in (rough, exact))
-    assert one == pytest.approx(other, abs=1e-6)
+    assert one == pytest.approx(other, rel=1e-9)
