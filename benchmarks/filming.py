@@ -10,6 +10,7 @@ are simulated with ``masiv.synth``: a 0.3 m cube of an elastic or a plastic mate
 from __future__ import annotations
 
 import argparse
+import functools
 import io
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from masiv.synth.motion import Skin, simulate
 from masiv.synth.picture import Surface, background, enlarged_camera, picture
 from masiv.synth.spec import CameraSpec, MaterialSpec, SynthSpec
 from masiv.synth.synthesise import ring
+from masiv.synth.texture import solid_color
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -148,13 +150,14 @@ def draw_exposure() -> None:
     cases = [
         ("1/1000 s", 2, 22.0), ("1/125 s", 16, 22.0), ("1/30 s", 66, 22.0), ("1/1000 s, too far away", 2, 75.0),
     ]  # fmt: skip
+    patches = functools.partial(solid_color, "patches", seed=0)
     figure, axes = plt.subplots(1, 4, figsize=(9, 2.6), layout="constrained")
     for ax, (title, span, angle) in zip(axes, cases, strict=True):
         camera = ring(CameraSpec(count=3, size=160, field_of_view_deg=angle, target=(0.1, 0.55, 0), heights=(1.1,)))[0]
         empty = background(enlarged_camera(camera, 2), 0)
         frames = range(60 - span // 2, 60 + span // 2, max(1, span // 16))
         surfaces = (Surface(skin.at(moved[k].astype(np.float64)), body.faces, body.local) for k in frames)
-        mean = np.mean([picture(camera, empty, s, "patches", 0, 2)[0] for s in surfaces], axis=0)
+        mean = np.mean([picture(camera, empty, s, patches, 2)[0] for s in surfaces], axis=0)
         ax.imshow(mean)
         ax.set_title(title, fontsize=9)
         ax.axis("off")

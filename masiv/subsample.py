@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
+T = TypeVar("T")
 
-def evenly_spread(values: Sequence[int], count: int) -> list[int]:
+
+def evenly_spread(values: Sequence[T], count: int) -> list[T]:
     """``count`` of ``values``, at least one, in their order, with the first and the last; all if there are no more."""
     if len(values) <= count:
         return list(values)

@@ -16,6 +16,7 @@ from masiv.synth.motion import Skin, simulate
 from masiv.synth.picture import rasterise
 from masiv.synth.spec import SynthSpec, read_spec
 from masiv.synth.synthesise import synthesise
+from masiv.synth.texture import solid_color
 
 SMALL = {
     "shape": {"kind": "sphere", "size": 0.4, "clearance": 0.3},
@@ -43,6 +44,26 @@ def test_scene_is_read_as_it_was_made(scene_folder):
     truth = yaml.safe_load((scene_folder / "truth.yaml").read_text())
     assert truth["material"]["law"] == "neo_hookean"
     assert len(json.loads((scene_folder / "all_data.json").read_text())) == 3 * 4
+
+
+def test_a_plain_body_shows_no_texture_and_a_weak_one_a_part_of_it():
+    places = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
+    for kind in ("noise", "stripes", "patches"):
+        full, weak, plain = (solid_color(kind, places, 3, contrast) for contrast in (1.0, 0.2, 0.0))
+        np.testing.assert_allclose(weak - plain, 0.2 * (full - plain))
+        assert np.ptp(plain, axis=0).max() < 1e-12
+        assert full.std() > 0.1
+
+
+def test_compressed_pictures_differ_a_little_and_stay_below_the_white_of_masks(scene_folder, tmp_path):
+    rough = SynthSpec.model_validate({**SMALL, "frames": 2, "jpeg_quality": 50})
+    synthesise(rough, tmp_path / "rough")
+    clean, compressed = (
+        cv2.imread(str(folder / "data/r_0_0.png")).astype(int) for folder in (scene_folder, tmp_path / "rough")
+    )
+    assert 0.5 < np.abs(clean - compressed).mean() < 12
+    assert np.corrcoef(clean.ravel(), compressed.ravel())[0, 1] > 0.97
+    assert compressed.max() <= 254
 
 
 def test_particles_project_onto_the_masks(scene_folder):

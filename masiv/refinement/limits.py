@@ -18,12 +18,14 @@ from masiv.models.parameters import Parameter
 from masiv.observations.base import Observation
 from masiv.refinement.effect_fit import absent
 from masiv.refinement.hypotheses import Hypothesis
+from masiv.subsample import evenly_spread
 
 LEVEL = 0.95
 """Probability that a strength is below its limit."""
 DRAWS = 2000
-FREQUENCIES = 8
-"""At which a force of unknown frequency is limited."""
+FREQUENCIES, PLACES = 6, 4
+"""At which a force of unknown frequency, and an effect at an unknown place, is limited beside where the ranking saw it:
+each takes a rollout or two for each strength."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,9 @@ def sensitivities(
 def places_to_limit(
     term: EffectTerm, ranked: dict[str, float], observations: Sequence[Observation]
 ) -> list[dict[str, float]]:
-    """Values of the parameters of ``term`` beside its strengths: where the ranking saw it, then its guesses; of a
-    frequency, even from one period in the longest of ``observations`` to two instants a period. Of an effect that sets
-    in abruptly the first alone: its derivatives hold near one place."""
+    """Values of the parameters of ``term`` beside its strengths: where the ranking saw it, then some of its guesses; of
+    a frequency, even from one period in the longest of ``observations`` to two instants a period. Of an effect that
+    sets in abruptly the first alone: its derivatives hold near one place."""
     if not term.others or term.nonsmooth:
         return [ranked]
     if [term.units.get(p.name) for p in term.others] == ["Hz"]:
@@ -84,7 +86,13 @@ def places_to_limit(
         high = 0.5 / min(float(np.median(np.diff(e.times))) for e in observations)
         shares = (np.arange(FREQUENCIES) + 0.5) / FREQUENCIES
         return [ranked, *({p.name: float(f)} for f in low + shares * (high - low))]
-    return [ranked, *({p.name: v for p, v in zip(term.others, guess, strict=True)} for guess in term.guesses)]
+    return [
+        ranked,
+        *(
+            {p.name: v for p, v in zip(term.others, guess, strict=True)}
+            for guess in evenly_spread(term.guesses, PLACES)
+        ),
+    ]
 
 
 def extended(at: LinearModel, term: EffectTerm, values: dict[str, float], columns: LinearModel) -> LinearModel:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from masiv.scene.camera import Camera
-from masiv.synth.texture import ground_color, solid_color
+from masiv.synth.texture import ground_color
 
 _SUN = np.array([0.45, 0.8, 0.4]) / np.linalg.norm([0.45, 0.8, 0.4])
 _AMBIENT, _DIRECT, _SHADOW = 0.62, 0.5, 0.55
@@ -25,11 +26,16 @@ class Surface:
 
 
 def picture(
-    camera: Camera, empty: np.ndarray, surface: Surface | None, texture: str, seed: int, supersampling: int
+    camera: Camera,
+    empty: np.ndarray,
+    surface: Surface | None,
+    color: Callable[[np.ndarray], np.ndarray],
+    supersampling: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The picture (H, W, 3) float [0, 1] that ``camera`` takes, and the object's share of each pixel (H, W).
 
-    ``empty`` is the ``background`` of the camera, ``supersampling`` times as large.
+    ``empty`` is the ``background`` of the camera, ``supersampling`` times as large. color: (N, 3) of places (N, 3) in
+    the texture's own space.
     """
     fine = enlarged_camera(camera, supersampling)
     image = empty.copy()
@@ -44,7 +50,7 @@ def picture(
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-30
         light = _AMBIENT * (0.75 + 0.25 * normal[:, 1]) + _DIRECT * np.clip(normal @ _SUN, 0, None)
-        image[hit] = solid_color(texture, local, seed) * light[:, None]
+        image[hit] = color(local) * light[:, None]
         shown[hit] = 1
     size = (camera.width, camera.height)
     return (

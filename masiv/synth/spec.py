@@ -56,7 +56,14 @@ class SynthSpec(_Part):
     fps: Fps = 24.0
     cameras: CameraSpec = CameraSpec.model_validate({})
     texture: Literal["noise", "stripes", "patches"] = "noise"
+    texture_contrast: float = Field(
+        1.0,
+        ge=0,
+        le=1,
+        description="of the texture's colors about their mean; 0: a plain body, whose spin does not show",
+    )
     image_noise: float = Field(1.5, ge=0, description="standard deviation, of 255")
+    jpeg_quality: int | None = Field(None, ge=1, le=100, description="pictures are compressed; none: they are not")
     supersampling: Annotated[int, Field(ge=1, le=8)] = 3
     particles: int = Field(20000, ge=100, le=10**7, description="in the simulation")
     truth_particles: int = Field(4096, ge=1, description="of them in gt/")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from masiv.shapes import make_body
 from masiv.synth.motion import Skin, simulate
 from masiv.synth.picture import Surface, background, enlarged_camera, picture
 from masiv.synth.spec import CameraSpec, SynthSpec
+from masiv.synth.texture import solid_color
 
 _SMALL = [cv2.IMWRITE_PNG_COMPRESSION, 9]
 
@@ -58,15 +60,16 @@ def _write_scene(spec: SynthSpec, draft: Path, progress: Progress) -> None:
     cameras = ring(spec.cameras)
     skin = Skin(body.vertices, body.particles)
     empty = [background(enlarged_camera(camera, spec.supersampling), spec.seed) for camera in cameras]
+    color = functools.partial(solid_color, spec.texture, seed=spec.seed, contrast=spec.texture_contrast)
     listing = []
     for done, frame in enumerate(range(-1, spec.frames)):
         surface = None
         if frame >= 0:
             surface = Surface(skin.at(motion[frame].astype(np.float64)), body.faces, body.local)
         for view, camera in enumerate(cameras):
-            image, share = picture(camera, empty[view], surface, spec.texture, spec.seed, spec.supersampling)
+            image, share = picture(camera, empty[view], surface, color, spec.supersampling)
             noise = np.random.default_rng([spec.seed, 4, view, frame + 1]).normal(0, spec.image_noise, image.shape)
-            image = np.rint(np.clip(255 * image + noise, 0, 254)).astype(np.uint8)
+            image = _compressed(np.rint(np.clip(255 * image + noise, 0, 254)).astype(np.uint8), spec.jpeg_quality)
             _write(draft / "data" / f"r_{view}_{frame}.png", image)
             if frame >= 0:
                 _write(draft / "data" / f"m_{view}_{frame}.png", np.where(share[..., None] >= 0.5, image, 255))
@@ -79,6 +82,14 @@ def _write_scene(spec: SynthSpec, draft: Path, progress: Progress) -> None:
         "simulated_particles": len(body.particles),
     }
     (draft / "truth.yaml").write_text(yaml.safe_dump(truth, sort_keys=False), encoding="utf-8")
+
+
+def _compressed(image: np.ndarray, quality: int | None) -> np.ndarray:
+    """``image`` (H, W, 3) as a JPEG of that quality shows it; no pixel is white, which masks mean."""
+    if quality is None:
+        return image
+    encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.minimum(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1], 254)
 
 
 def ring(spec: CameraSpec) -> tuple[Camera, ...]:

@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+MEAN = 0.53
+"""Of the colors of a texture, about."""
 
-def solid_color(kind: str, local: np.ndarray, seed: int) -> np.ndarray:
-    """Color (N, 3) in [0, 1] of points (N, 3), in units of the body's size; kinds: noise, stripes, patches."""
+
+def solid_color(kind: str, local: np.ndarray, seed: int, contrast: float = 1.0) -> np.ndarray:
+    """Color (N, 3) in [0, 1] of points (N, 3), in units of the body's size; kinds: noise, stripes, patches.
+    contrast: factor on the distance from ``MEAN``."""
+    return (1 - contrast) * MEAN + contrast * _full_contrast(kind, local, seed)
+
+
+def _full_contrast(kind: str, local: np.ndarray, seed: int) -> np.ndarray:
     rng = np.random.default_rng([seed, 1])
     if kind == "patches":
         seeds, colors = rng.uniform(-0.6, 0.6, (160, 3)), rng.uniform(0.12, 0.95, (160, 3))
@@ -17,7 +25,7 @@ def solid_color(kind: str, local: np.ndarray, seed: int) -> np.ndarray:
         light, dark = rng.uniform(0.6, 0.95, 3), rng.uniform(0.1, 0.4, 3)
         share = 0.5 + 0.5 * np.tanh(3 * np.sin(2 * np.pi * along))
         return np.clip(dark + share * (light - dark) + 0.1 * _waves(rng, local, 8, 9.0), 0.05, 0.97)
-    return np.clip(0.53 + 0.24 * _waves(rng, local, 6, 2.0) + 0.2 * _waves(rng, local, 10, 5.0), 0.05, 0.97)
+    return np.clip(MEAN + 0.24 * _waves(rng, local, 6, 2.0) + 0.2 * _waves(rng, local, 10, 5.0), 0.05, 0.97)
 
 
 def ground_color(points: np.ndarray, seed: int) -> np.ndarray:
