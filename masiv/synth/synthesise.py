@@ -89,7 +89,9 @@ def _compressed(image: np.ndarray, quality: int | None) -> np.ndarray:
     if quality is None:
         return image
     encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    return np.minimum(cv2.imdecode(encoded, cv2.IMREAD_COLOR)[..., ::-1], 254)
+    decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return np.minimum(decoded[..., ::-1], 254)
 
 
 def ring(spec: CameraSpec) -> tuple[Camera, ...]:
