@@ -66,6 +66,25 @@ def test_noise_jpeg_and_a_shadow(seed):
     assert np.mean(found) > 0.87
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_small_plain_object_darker_than_the_scene_is_no_shadow(seed):
+    """A grey ball in front of a bright wall: one color, a thousandth of the picture, shaded like a shadow would be."""
+    rng, side = np.random.default_rng(seed), 360
+    wall = np.broadcast_to(np.linspace(190, 215, side)[:, None, None] * [0.83, 0.9, 1.0], (side, side, 3))
+    y, x = np.mgrid[:side, :side]
+    pictures, covers = [], []
+    for step in range(5):
+        across, down = (x - 80 - 50 * step) / 12, (y - 150 - 6 * step**2) / 12
+        cover = across**2 + down**2 < 1
+        light = 0.6 + 0.4 * np.sqrt(np.maximum(1 - across**2 - down**2, 0)) * (1 - 0.5 * down) / 1.5
+        ball = light[..., None] * rng.normal(1, 0.03, 3) * [118, 112, 108]
+        pictures.append(photograph(rng, np.where(cover[..., None], ball, wall), 2.0, 80))
+        covers.append(cover)
+    model = learn_background({0: np.stack(pictures)}, {0: photograph(rng, wall, 2.0, 80)})
+    found = [overlap(model.mask(0, picture), cover) for picture, cover in zip(pictures, covers, strict=True)]
+    assert min(found) > 0.85
+
+
 def test_light_that_changes_is_no_object():
     rng = np.random.default_rng(3)
     pictures, plate, covers = recording(rng, gain=0.85)

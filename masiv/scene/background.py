@@ -34,12 +34,17 @@ _SHADOW_BLUR = 0.8
 the object touches the ground. From 1.5 to 0.5 pixels the masks of five scenes change by 1 to 2 % of their area."""
 _OUTLIER_SHARE = 0.3
 """Share of the object's colours that the histogram may not contain, since no confident pixel shows them."""
+_LEAST_COVERAGE = 0.05
+"""Of the object, in its prior probability: a picture counts as if it were cropped to twenty times the object. How much
+of the empty scene a picture shows says nothing of the pixels near the object."""
 _CLIP = 10.0
 """Log-odds of one pixel, at most: no model of noise is trusted beyond."""
 _NEAR = 17
 """Diameter of the neighbourhood of the object [pixels], in which JPEG noise is larger: a block of 4:2:0 is 16 wide."""
 _SMALLEST_COMPONENT = 0.02
-_ROUNDS = 2
+_MAX_ROUNDS, _SETTLED = 10, 0.01
+"""Rounds of masks and what is learnt from them, at most, and the relative change of the masks' area at which they end: of
+a plain object the first masks hold a part, whose colors find the rest."""
 _MAX_SAMPLES = 2_000_000
 """Pixels from which a covariance is estimated, at most: its relative error is then 0.1 %."""
 _MAX_LIGHT_SAMPLES = 100_000
@@ -221,17 +226,19 @@ def learn_background(images: Mapping[int, Sequence[np.ndarray]], plates: dict[in
     uniform = np.full((_BINS,) * 3, -3 * math.log(256.0), np.float32)
     log_colours = uniform
     correlated = 1.0
-    for learnt in range(_ROUNDS + 1):
+    area = math.inf
+    for learnt in range(_MAX_ROUNDS + 1):
         backgrounds = {view: _background(plates[view], own, taken[view]) for view, own in pictures.items()}
         noise = _noise(pictures, backgrounds, taken, masks)
         if learnt == 0:
             correlated = _correlated_pixels(pictures, backgrounds, taken)
         cast = _shadow_cast(pictures, backgrounds)
-        coverage = np.clip(np.mean([np.mean(m) for m in (masks or taken).values()]), 1e-3, 0.5)
+        coverage = np.clip(np.mean([np.mean(m) for m in (masks or taken).values()]), _LEAST_COVERAGE, 0.5)
         model = BackgroundModel(
             backgrounds, noise, correlated, cast, log_colours, float(np.log(coverage / (1 - coverage)))
         )
-        if learnt == _ROUNDS:
+        before, area = area, float(sum(m.sum() for own in masks.values() for m in own)) if masks else math.inf
+        if learnt == _MAX_ROUNDS or abs(area - before) <= _SETTLED * area < math.inf:
             return model
         masks = {v: [model.mask(v, p) for p in own] for v, own in pictures.items()}
         taken = {
