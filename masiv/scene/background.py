@@ -43,8 +43,8 @@ _NEAR = 17
 """Diameter of the neighbourhood of the object [pixels], in which JPEG noise is larger: a block of 4:2:0 is 16 wide."""
 _SMALLEST_COMPONENT = 0.02
 _MAX_ROUNDS, _SETTLED = 10, 0.01
-"""Rounds of masks and what is learnt from them, at most, and the relative change of the masks' area at which they end: of
-a plain object the first masks hold a part, whose colors find the rest."""
+"""Rounds of masks and what is learnt from them, at most, and the relative change of the masks' area at which they end:
+of a plain object the first masks hold a part, whose colours find the rest."""
 _MAX_SAMPLES = 2_000_000
 """Pixels from which a covariance is estimated, at most: its relative error is then 0.1 %."""
 _MAX_LIGHT_SAMPLES = 100_000
