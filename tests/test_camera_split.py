@@ -13,6 +13,7 @@ from ring_scene import ring, spheres_scene
 
 from masiv.config import Config
 from masiv.continuum.camera_split import MIN_CAMERAS, CameraSplit, camera_halves
+from masiv.errors import InputError
 from masiv.inference.error_covariance import matern52
 from masiv.inference.marginal_likelihood import ParameterPriors, SizePriors, marginal
 from masiv.inference.motion_modes import MotionModes
@@ -210,9 +211,10 @@ def test_a_run_measures_its_error_once_and_goes_on_after_the_first_half(taichi, 
     np.testing.assert_array_equal(again.tracking_error(CENTRE[None], scene.times), error)
 
 
-def test_few_cameras_are_not_split_and_the_switch_counts(tmp_path):
+def test_few_cameras_are_refused_and_the_switch_counts(tmp_path):
     run = run_of(tmp_path)
-    assert stages.ensure_camera_split(run, SETTINGS, scene_of(ring(MIN_CAMERAS - 1)), silent) is None
+    with pytest.raises(InputError, match="has 5 cameras that are not held out, and two sets need 6"):
+        stages.ensure_camera_split(run, SETTINGS, scene_of(ring(MIN_CAMERAS - 1)), silent)
     off = SETTINGS.model_copy(update={"refine": RefineConfig(camera_split=False)})
     assert stages.ensure_camera_split(run, off, scene_of(ring()), silent) is None
     assert not (run.path / "camera_split").exists()

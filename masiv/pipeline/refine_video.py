@@ -60,9 +60,9 @@ def recording_of(run: VideoRun, progress: Progress, *, split_cameras: bool) -> R
     from masiv.refinement.from_video import Recording, split_frames
 
     trajectory = stages.load_trajectory(run.folder)
+    split = stages.ensure_camera_split(run.folder, run.config, run.given_scene, progress) if split_cameras else None
     held_out = stages.ensure_held_out_trajectory(run.folder, run.config, run.scene, progress)
     fitted = split_frames(run.scene.frame_count, run.folder.fit_frames)
-    split = stages.ensure_camera_split(run.folder, run.config, run.given_scene, progress) if split_cameras else None
     return Recording(run.path.resolve().name, run.scene, trajectory, held_out or trajectory, fitted, split)
 
 

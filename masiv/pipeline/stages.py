@@ -223,18 +223,22 @@ def ensure_held_out_trajectory(run: RunFolder, config: Config, scene: Scene, pro
 
 def ensure_camera_split(run: RunFolder, config: Config, scene: Scene, progress: Progress) -> CameraSplit | None:
     """All frames of ``scene``, whose cameras are those that were given, reconstructed from each half of its cameras;
-    None if ``config`` does not ask for it, or there are too few cameras. Made once: RUN/camera_split keeps it."""
-    from masiv.continuum.camera_split import CameraSplit, camera_halves
+    None if ``config`` does not ask for it. Made once: RUN/camera_split keeps it. Raises InputError for too few
+    cameras."""
+    from masiv.continuum.camera_split import MIN_CAMERAS, CameraSplit, camera_halves
     from masiv.splat.dynamic import DynamicGaussians
     from masiv.splat.reconstruct import reconstruct
 
-    if not config.refine.camera_split or not scene.cameras:
+    if not config.refine.camera_split:
         return None
     visible = scene.restricted(holdout_cameras=run.holdout_cameras)
     centre = load_gaussians(run).canonical.means.mean(dim=0).double().numpy()
     halves = camera_halves(visible, centre)
     if halves is None:
-        return None
+        raise InputError(
+            f"refine.camera_split: {scene.path} has {len(visible.views)} cameras that are not held out, and two sets "
+            f"need {MIN_CAMERAS}: leave it out"
+        )
     folders = [run.path / "camera_split" / str(k) for k in range(len(halves))]
     for number, (folder, views) in enumerate(zip(folders, halves, strict=True), 1):
         if folder.is_dir():
