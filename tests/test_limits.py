@@ -65,6 +65,7 @@ def test_frequencies_are_even_over_what_the_record_could_show(model):
 def test_places_are_the_guesses_and_an_abrupt_effect_has_one(model):
     term = replace(model.term(NAME), units={STRENGTH: "kg", FREQUENCY: "m"}, guesses=((0.1,), (0.2,)))
     assert places_to_limit(term, {FREQUENCY: 0.3}, []) == [{FREQUENCY: 0.3}, {FREQUENCY: 0.1}, {FREQUENCY: 0.2}]
+    assert places_to_limit(term, {STRENGTH: 3.0, FREQUENCY: 0.2}, []) == [{FREQUENCY: 0.2}, {FREQUENCY: 0.1}]
     assert places_to_limit(replace(term, nonsmooth=True), {FREQUENCY: 0.3}, []) == [{FREQUENCY: 0.3}]
 
 
