@@ -3,6 +3,7 @@
 python docs/gallery.py [EFFECT …]          (a minute or two for all; clips are written to docs/gallery)
 """
 
+import functools
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from masiv.scene.camera import Camera
 from masiv.scene.scene import Ground
 from masiv.simulation.simulate import simulate
 from masiv.synth.picture import Surface, background, enlarged_camera, picture
+from masiv.synth.texture import solid_color
 from masiv.twin import Twin
 from masiv.twin.body import TwinEffect
 
@@ -131,10 +133,11 @@ def pictures(positions: np.ndarray) -> list[np.ndarray]:
     points, surface, faces = cube()
     view = camera()
     empty = background(enlarged_camera(view, SUPERSAMPLING), SEED)
+    patches = functools.partial(solid_color, "patches", seed=SEED)
     made = []
     for now in positions:
         body = Surface(now[surface].astype(np.float64), faces, points[surface] / EDGE * 0.35)
-        made.append((255 * picture(view, empty, body, "patches", SEED, SUPERSAMPLING)[0]).round().astype(np.uint8))
+        made.append((255 * picture(view, empty, body, patches, SUPERSAMPLING)[0]).round().astype(np.uint8))
     return made
 
 
