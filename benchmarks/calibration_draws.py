@@ -181,7 +181,7 @@ def linear(rng: np.random.Generator, *, with_effect: bool, narrow: bool) -> Draw
 
 MPM_EFFECTS = ("linear_drag", "quadratic_drag", "body_force", "gravity_scale", "viscosity")
 MPM_FRAMES, MPM_FITTED = 11, 8
-TRUE_PARTICLES, PARTICLES = 600, 150
+TRUE_PARTICLES, PARTICLES = 1600, 400
 
 
 def mpm(rng: np.random.Generator, *, with_effect: bool, narrow: bool) -> Draw:
@@ -213,8 +213,7 @@ def mpm(rng: np.random.Generator, *, with_effect: bool, narrow: bool) -> Draw:
     shaken = motion.positions.copy()
     shaken[1:] += errors(rng, shaken[0], motion.times, jitter, rng.uniform(0.1, 0.5))[1:]
     config = RefineConfig(
-        particles=PARTICLES, search_particles=PARTICLES, laws=["neo_hookean"], shortlist=2, max_effects=1,
-        test_fraction=0.0,
+        particles=PARTICLES, search_particles=PARTICLES, laws=["neo_hookean"], max_effects=1, test_fraction=0.0,
     )  # fmt: skip
     forward_model, _, fits = fits_of(scene, SampledMotion(shaken, motion.times, motion.volume), MPM_FITTED, config)
     return Draw(forward_model, fits, config, effect, truth)

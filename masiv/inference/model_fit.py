@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from masiv.errors import NonFiniteError
 from masiv.inference.least_squares import (
@@ -169,6 +170,21 @@ def evaluate_fit(
         part_mm(fields, observations, "test"), fields,
         standard_errors(parameters, values, variances * inflation),
     )  # fmt: skip
+
+
+def linear_minimum(fitted: ModelFit, robust_scale: float) -> float:
+    """The least cost [m²] that the derivatives of ``fitted`` promise, within the bounds of its parameters."""
+    if not fitted.parameters:
+        return fitted.cost
+    scale = np.array([p.step for p in fitted.parameters])
+    here = np.array([p.fitted(fitted.values[p.name]) for p in fitted.parameters])
+    # A value at its bound may be beyond it by rounding.
+    lower = np.minimum(np.array([p.fitted(p.lower) for p in fitted.parameters]) - here, -1e-9)
+    upper = np.maximum(np.array([p.fitted(p.upper) for p in fitted.parameters]) - here, 1e-9)
+    columns, weight = fitted.jacobian * scale, soft_l1_weight(fitted.residual, robust_scale)
+    q, r = np.linalg.qr(columns * weight[:, None])
+    step = lsq_linear(r, -(q.T @ (fitted.residual * weight)), (lower / scale, upper / scale)).x
+    return min(soft_l1_mean_square(fitted.residual + columns @ step, robust_scale), fitted.cost)
 
 
 def gauss_newton_fit(

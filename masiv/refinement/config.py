@@ -68,5 +68,7 @@ class RefineConfig(BaseModel):
         "needs six cameras, and the time of the reconstruct stage twice",
     )  # fmt: skip
     min_explained: float = Field(
-        0.1, ge=0, le=1, description="part of the residual that an effect must explain in the ranking to be fitted"
-    )
+        0.1, ge=0, le=1,
+        description="part of the residual that an effect must explain in the ranking to be fitted; if one does, so are "
+        "those that explain nearly as much",
+    )  # fmt: skip

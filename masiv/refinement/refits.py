@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from masiv.effects.catalogue import effect_named
 from masiv.errors import MasivError
+from masiv.inference.least_squares import Linearization, gauss_newton_jump
 from masiv.inference.model_fit import (
     ModelFit,
     gauss_newton_fit,
     held_parameters,
+    linear_minimum,
     linear_strengths,
     rank_by_bic,
+    residual_of,
 )
 from masiv.models.base import EffectTerm, ForwardModel
 from masiv.refinement.rounds import Trial
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.refinement.tasks import map_tasks
-from masiv.refinement.trials import converged, could_improve
+from masiv.refinement.trials import converged, could_improve, could_reach
 from masiv.workers import TaskError
 
 FALSE_MINIMUM_RATIO = 0.5
 """A model with one more effect that has less than this part of its base's cost may have got out of a false minimum."""
 LONGER_BUDGET = 3
 """Derivatives that a fit may take that has not reached what the ranking promised."""
+MIN_GAIN_LEFT = 0.3
+"""Part of the cost that a fit must be able to lose by its own derivatives to go on: less is left to the evidence, which
+extrapolates. Chosen."""
+MAX_PASSES = 6
+"""How often a fit goes on that has not ended. Chosen."""
 
 
 def refit_simpler(state: SearchState, trials: Sequence[Trial], settings: SearchSettings) -> list[Trial]:
@@ -71,13 +79,19 @@ def _refit_from(
 def refit_unconverged(
     state: SearchState, trials: Sequence[Trial], bases: Sequence[ModelFit], settings: SearchSettings
 ) -> list[Trial]:
-    """Trials, best first, of which those that have not reached what the ranking promised go on with fresh derivatives:
-    from where they ended, and from where the best with the same law did. Those that would not be as good as the best
-    trial if they kept their promise do not."""
+    """Trials, best first, of which those go on with fresh derivatives that have not reached what the ranking promised,
+    and those that have not ended: from where they are, and from where the best with the same law is. Those that would
+    not be as good as the best trial if they kept their promise do not."""
     own = {b.model.family.kind: b for b in reversed(bases)}
-    failed = [t for t in trials if not converged(t, bases) and could_improve(t.candidate, own[t.law], trials)]
+    least, scale = trials[0].fitted.cost, state.robust_scale
+    failed = [
+        t
+        for t in trials
+        if (not converged(t, bases) and could_improve(t.candidate, own[t.law], trials))
+        or _goes_on(t.fitted, least, scale)
+    ]
     best = {law: next(t.fitted for t in trials if t.law == law) for law in {t.law for t in trials}}
-    tasks = [(t.fitted, best[t.law], state.robust_scale) for t in failed]
+    tasks = [(t.fitted, best[t.law], least, scale) for t in failed]
     again: dict[int, ModelFit] = {}
     results = map_tasks(settings.workers, state.forward_model, _refit_longer, tasks)
     for done, (trial, fit) in enumerate(zip(failed, results, strict=True)):
@@ -87,9 +101,18 @@ def refit_unconverged(
     return [replace(t, fitted=again.get(id(t), t.fitted)) for t in trials]
 
 
-def _refit_longer(forward_model: ForwardModel, fitted: ModelFit, best: ModelFit, robust_scale: float) -> ModelFit:
-    """The better of ``fitted`` fitted on, and from what it shares with ``best``. Raises MasivError if neither start can
-    be simulated."""
+def _goes_on(fitted: ModelFit, least: float, robust_scale: float) -> bool:
+    """Whether ``fitted`` has much to gain by its own derivatives, and could then be as good as a fit of cost
+    ``least``."""
+    gain = 1 - linear_minimum(fitted, robust_scale) / max(fitted.cost, 1e-300)
+    return gain > MIN_GAIN_LEFT and could_reach(fitted.cost, gain, least)
+
+
+def _refit_longer(
+    forward_model: ForwardModel, fitted: ModelFit, best: ModelFit, least: float, robust_scale: float
+) -> ModelFit:
+    """The better of ``fitted`` fitted on, and from what it shares with ``best``; until it has ended or cannot be as
+    good as a fit of cost ``least``. Raises MasivError if neither start can be simulated."""
     own = {p.name for p in fitted.parameters}
     shared = {p.name: best.values[p.name] for p in best.parameters if p.name in own}
     starts = [fitted.values] if best is fitted else [fitted.values, {**fitted.values, **shared}]
@@ -97,18 +120,34 @@ def _refit_longer(forward_model: ForwardModel, fitted: ModelFit, best: ModelFit,
     failed: MasivError | None = None
     for values in starts:
         try:
-            fits.append(
-                gauss_newton_fit(
-                    forward_model, fitted.model, values, budget=LONGER_BUDGET * (len(fitted.parameters) + 2),
-                    robust_scale=robust_scale, held=held_parameters(forward_model, fitted),
-                )
-            )  # fmt: skip
+            fits.append(_fitted_on(forward_model, fitted, values, LONGER_BUDGET, robust_scale))
         except MasivError as error:
             failed = error
     if not fits:
         assert failed is not None
         raise failed
-    return min(fits, key=lambda f: f.cost)
+    here = min(fits, key=lambda f: f.cost)
+    for _ in range(MAX_PASSES):
+        if not _goes_on(here, least, robust_scale):
+            break
+        residual = residual_of(forward_model, here.model)
+        known = Linearization(here.values, here.residual, here.jacobian)
+        jump = gauss_newton_jump(residual, here.parameters, known, robust_scale=robust_scale)
+        reached = _fitted_on(forward_model, here, jump.values, LONGER_BUDGET, robust_scale)
+        if reached.cost >= here.cost:
+            break
+        here = reached
+    return here
+
+
+def _fitted_on(
+    forward_model: ForwardModel, fitted: ModelFit, values: Mapping[str, float], derivatives: int, robust_scale: float
+) -> ModelFit:
+    """The model of ``fitted`` from ``values`` with at most so many derivatives. Raises MasivError."""
+    return gauss_newton_fit(
+        forward_model, fitted.model, values, budget=derivatives * (len(fitted.parameters) + 2),
+        robust_scale=robust_scale, held=held_parameters(forward_model, fitted),
+    )  # fmt: skip
 
 
 def restart_base(state: SearchState, best: ModelFit) -> ModelFit:

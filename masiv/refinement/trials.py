@@ -40,7 +40,7 @@ def try_effects(state: SearchState, bases: Sequence[ModelFit], settings: SearchS
     """Of each base, the effects that explain most, fitted."""
     out = Attempts()
     for base in bases:
-        worth = [c.effect for c in out.ranking.candidates if c.explained >= settings.config.min_explained]
+        worth = [c.effect for c in worth_fitting(out.ranking.candidates, settings.config.min_explained)]
         if out.ranking.candidates and not worth:
             break
         # What the first base's ranking leaves out is not looked at again for the next base.
@@ -52,7 +52,7 @@ def try_effects(state: SearchState, bases: Sequence[ModelFit], settings: SearchS
             out = replace(out, ranking=ranking)
         if settings.rank_only:
             break
-        candidates = [c for c in ranking.candidates if c.explained >= settings.config.min_explained]
+        candidates = worth_fitting(ranking.candidates, settings.config.min_explained)
         shortlist = [
             c for c in candidates[: settings.shortlist] if start.curriculum or could_improve(c, base, out.trials)
         ]
@@ -148,11 +148,24 @@ def _needs_wider_shortlist(state: SearchState, trials: Sequence[Trial]) -> bool:
     return state.noise.reduced_chi(best.squares) > WIDER_REDUCED_CHI
 
 
+def worth_fitting(candidates: Sequence[Candidate], min_explained: float) -> list[Candidate]:
+    """Those of ``candidates``, best explained first, that explain at least ``min_explained``, and, if one does, all
+    that may turn out as good as the best: it is not to be named because the others were not weighed."""
+    best = max((c.explained for c in candidates), default=0.0)
+    least = min_explained if best < min_explained else min(min_explained, best / MAX_PROMISE_ERROR)
+    return [c for c in candidates if c.explained >= least]
+
+
 def could_improve(candidate: Candidate, base: ModelFit, trials: Sequence[Trial]) -> bool:
     """Whether ``candidate``, if it explains MAX_PROMISE_ERROR times what the ranking says, would be as good as the best
     of ``trials``: a law that explains the motion worse need not be fitted with what would not make up for that."""
-    best = min((t.fitted.cost for t in trials), default=math.inf)
-    return base.cost * (1 - min(MAX_PROMISE_ERROR * candidate.explained, 1.0)) <= best
+    return could_reach(base.cost, candidate.explained, min((t.fitted.cost for t in trials), default=math.inf))
+
+
+def could_reach(cost: float, explained: float, least: float) -> bool:
+    """Whether a fit of ``cost`` could be as good as one of cost ``least`` if a linear model says which part of it would
+    go."""
+    return cost * (1 - min(MAX_PROMISE_ERROR * explained, 1.0)) <= least
 
 
 def converged(trial: Trial, bases: Sequence[ModelFit]) -> bool:
