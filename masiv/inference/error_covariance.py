@@ -76,47 +76,50 @@ def matern52(distance: np.ndarray) -> np.ndarray:
     return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
 
 
-def matern52_by_log_length(distance: np.ndarray) -> np.ndarray:
-    """Derivative of ``matern52`` by the logarithm of the correlation length."""
-    scaled = SQRT5 * distance
-    return scaled**2 / 3 * (1 + scaled) * np.exp(-scaled)
-
-
 class BlockCovariance:
     """C (T, T) [m²] of ``block`` as a function of the logarithms of the sizes (3 G + 2,)."""
 
     def __init__(self, block: ErrorBlock) -> None:
         self.block = block
-        self._smooth = np.outer(block.smooth, block.smooth)
-        self._nugget = NUGGET * np.eye(len(block.lags))
-        self._grid = np.outer(block.grid, block.grid) * (matern52(block.lags / block.grid_length) + self._nugget)
-        jitter = np.zeros(len(block.lags)) if block.grid_jitter is None else block.grid_jitter
-        self._grid_jitter = np.diag(jitter**2)
+        self.scaled_lags = SQRT5 * block.lags
+        self.smooth = np.outer(block.smooth, block.smooth)
+        nugget = NUGGET * np.eye(len(block.lags))
+        self.smooth_nugget = self.smooth * nugget
+        self.grid = np.outer(block.grid, block.grid) * (matern52(block.lags / block.grid_length) + nugget)
+        self.grid_jitter = np.zeros(len(block.lags)) if block.grid_jitter is None else block.grid_jitter**2
 
-    def _parts(self, logs: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        values, groups, g = np.exp(logs), len(logs) // 3, self.block.group
-        smooth = values[groups + g] ** 2 * self._smooth
-        jitter = float(self.block.jitter * values[g]) ** 2
-        return jitter, smooth, values[-2] ** 2 * self._grid, values[-1] ** 2 * self._grid_jitter
-
-    def _distance(self, logs: np.ndarray) -> np.ndarray:
-        return self.block.lags / np.exp(logs[2 * (len(logs) // 3) + self.block.group])
+    def at(self, logs: np.ndarray) -> CovarianceAt:
+        """C, and what its gradient needs, at ``logs``."""
+        return CovarianceAt(self, logs)
 
     def __call__(self, logs: np.ndarray) -> np.ndarray:
-        jitter, smooth, grid, grid_jitter = self._parts(logs)
-        return (
-            jitter * np.eye(len(grid)) + smooth * (matern52(self._distance(logs)) + self._nugget) + grid + grid_jitter
-        )
+        return self.at(logs).matrix
 
-    def gradient(self, logs: np.ndarray, by_covariance: np.ndarray) -> np.ndarray:
-        """Gradient (3 G + 2,) of a function by the logarithms, from that by C (T, T)."""
-        jitter, smooth, grid, grid_jitter = self._parts(logs)
-        distance = self._distance(logs)
-        groups, g = len(logs) // 3, self.block.group
-        out = np.zeros(len(logs))
-        out[g] = 2 * jitter * np.trace(by_covariance)
-        out[groups + g] = 2 * float((by_covariance * smooth * (matern52(distance) + self._nugget)).sum())
-        out[2 * groups + g] = float((by_covariance * smooth * matern52_by_log_length(distance)).sum())
-        out[-2] = 2 * float((by_covariance * grid).sum())
-        out[-1] = 2 * float((by_covariance * grid_jitter).sum())
-        return out
+
+class CovarianceAt:
+    """C (T, T) [m²] of a block at ``logs`` (3 G + 2,), as ``matrix``."""
+
+    def __init__(self, known: BlockCovariance, logs: np.ndarray) -> None:
+        groups, g = len(logs) // 3, known.block.group
+        self._places = [g, groups + g, 2 * groups + g, -2, -1]
+        jitter, smooth, length, grid, grid_jitter = np.exp(logs[self._places])
+        self._scaled = known.scaled_lags / length
+        self._size, self._decay = smooth**2 * known.smooth, np.exp(-self._scaled)
+        self._smooth = self._size * (1 + self._scaled * (1 + self._scaled / 3)) * self._decay
+        self._smooth += smooth**2 * known.smooth_nugget
+        self._jitter, self._grid = float(known.block.jitter * jitter) ** 2, grid**2 * known.grid
+        self._grid_jitter = grid_jitter**2 * known.grid_jitter
+        self.matrix = self._smooth + self._grid
+        self.matrix.flat[:: len(self.matrix) + 1] += self._jitter + self._grid_jitter
+
+    def add_gradient(self, out: np.ndarray, by_covariance: np.ndarray) -> None:
+        """Add the gradient of a function by the logarithms to ``out`` (3 G + 2,), from that by C (T, T)."""
+        diagonal, scaled = by_covariance.diagonal(), self._scaled
+        by_length = self._size * scaled**2 * ((1 + scaled) / 3) * self._decay
+        out[self._places] += [
+            2 * self._jitter * diagonal.sum(),
+            2 * (by_covariance * self._smooth).sum(),
+            (by_covariance * by_length).sum(),
+            2 * (by_covariance * self._grid).sum(),
+            2 * (diagonal @ self._grid_jitter),
+        ]

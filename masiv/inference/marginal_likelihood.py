@@ -17,7 +17,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 from scipy.optimize import minimize
 from scipy.special import log_ndtr
 
@@ -119,45 +120,59 @@ def _interval(lags: np.ndarray) -> float:
     return float(np.median(np.diag(lags, 1))) if len(lags) > 1 else 1.0
 
 
+def _columns(block: ErrorBlock, offset: np.ndarray) -> np.ndarray:
+    """(T, 1 + P, K): the residual ``offset`` (P,) from the fitted values, and the derivatives."""
+    residual = block.residual + block.jacobian @ offset
+    return np.concatenate([residual[:, None], block.jacobian.swapaxes(1, 2)], axis=1)
+
+
+def _cholesky(matrix: np.ndarray) -> np.ndarray:
+    """The lower factor (T, T), zero above. LAPACK without SciPy's checks, which take longer than the small matrices of
+    a record. Raises LinAlgError."""
+    factor, info = dpotrf(matrix, lower=1)
+    if info != 0:
+        raise np.linalg.LinAlgError(f"the covariance of errors is not positive definite (minor {info})")
+    return factor
+
+
 class _Likelihood:
     """The marginal likelihood as a function of the logarithms of the sizes."""
 
     def __init__(self, blocks: Sequence[ErrorBlock], priors: ParameterPriors, sizes: SizePriors) -> None:
         self.covariances = [BlockCovariance(b) for b in blocks]
-        # The residual at the prior mean, and the derivatives: (T, K, 1 + P).
-        self.data = [
-            np.concatenate([(b.residual + b.jacobian @ priors.mean)[:, :, None], b.jacobian], axis=2) for b in blocks
-        ]
-        self.priors, self.sizes = priors, sizes
+        # The residual at the prior mean, and the derivatives: (T, 1 + P, K), whose rows of one column lie together.
+        self.data = [np.asfortranarray(_columns(b, priors.mean).reshape(len(b.residual), -1)) for b in blocks]
+        self.priors, self.sizes, self.columns = priors, sizes, 1 + len(priors.mean)
 
     def terms(self, logs: np.ndarray, *, gradient: bool = False) -> _Terms:
         """Of each component of the prior; with the gradient of the sum of all by ``logs`` if asked for."""
-        columns = self.data[0].shape[2]
-        gram, constant = np.zeros((columns, columns)), 0.0
+        gram, constant = np.zeros((self.columns, self.columns)), 0.0
         whitened = []
-        for covariance, data in zip(self.covariances, self.data, strict=True):
-            factor = cholesky(covariance(logs), lower=True, check_finite=False)
-            flat = data.reshape(len(data), -1)
-            white = solve_triangular(factor, flat, lower=True, check_finite=False)
-            rows = white.reshape(-1, columns)
-            gram += covariance.block.weight * (rows.T @ rows)
-            constant -= (
-                covariance.block.weight * data.shape[1] * (np.log(factor.diagonal()).sum() + 0.5 * len(data) * LOG2PI)
-            )
-            whitened.append((factor, white))
-        logp, mean, covariance, by_gram = self._components(gram)
-        terms = _Terms(constant + logp, mean, covariance)
+        for known, data in zip(self.covariances, self.data, strict=True):
+            covariance, weight = known.at(logs), known.block.weight
+            factor = _cholesky(covariance.matrix)
+            white = dtrtrs(factor, data, lower=1)[0]
+            rows = white.reshape((-1, self.columns), order="F")
+            gram += weight * (rows.T @ rows)
+            each = np.log(factor.diagonal()).sum() + 0.5 * len(data) * LOG2PI
+            constant -= weight * known.block.residual.shape[1] * each
+            whitened.append((covariance, factor, white))
+        logp, mean, spread, by_gram = self._components(gram)
+        terms = _Terms(constant + logp, mean, spread)
         if not gradient:
             return terms
         share = np.exp(terms.logp - np.logaddexp.reduce(terms.logp))
         slope = np.tensordot(share, by_gram, 1)
         out = np.zeros(len(logs))
-        for block, data, (factor, white) in zip(self.covariances, self.data, whitened, strict=True):
-            solved = solve_triangular(factor, white, lower=True, trans=1, check_finite=False)
-            shaped = solved.reshape(data.shape)
-            spread = (shaped @ slope).reshape(len(data), -1) @ solved.T
-            inverse = cho_solve((factor, True), np.eye(len(data)), check_finite=False)
-            out += block.gradient(logs, -block.block.weight * (0.5 * data.shape[1] * inverse + spread))
+        for known, (covariance, factor, white) in zip(self.covariances, whitened, strict=True):
+            solved = dtrtrs(factor, white, lower=1, trans=1)[0]
+            # (slope @ rows.T).T: its columns lie as those of the rows do.
+            sloped = (slope @ solved.reshape((-1, self.columns), order="F").T).T
+            by_covariance = sloped.reshape(solved.shape, order="F") @ solved.T
+            lower = dpotri(factor, lower=1)[0]  # of the inverse, and zero above
+            half = 0.5 * known.block.residual.shape[1]
+            by_covariance += half * (lower + lower.T - np.diag(lower.diagonal()))
+            covariance.add_gradient(out, -known.block.weight * by_covariance)
         return replace(terms, gradient=out)
 
     def by_another_grid(self, logs: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -170,10 +185,10 @@ class _Likelihood:
             if grids is None or len(grids) < 2:
                 continue
             factor = cholesky(known(logs), lower=True, check_finite=False)
-            solved = cho_solve((factor, True), np.moveaxis(grids, 0, -1).reshape(len(factor), -1), check_finite=False)
-            rows = data.shape[0] * data.shape[1]
-            derivatives = data[..., 1:].reshape(rows, len(covariance))
-            moved.append(known.block.weight * (derivatives.T @ solved.reshape(rows, len(grids))))
+            each = np.moveaxis(grids, 0, 1).reshape(len(factor), -1)  # (T, S, K), as the data
+            solved = cho_solve((factor, True), np.asfortranarray(each), check_finite=False)
+            derivatives = data.reshape((-1, self.columns), order="F")[:, 1:]
+            moved.append(known.block.weight * (derivatives.T @ solved.reshape((-1, len(grids)), order="F")))
         if not moved:
             return np.zeros_like(covariance)
         shifts = covariance @ np.sum(moved, axis=0)
