@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from masiv.errors import MasivError, NonFiniteError
 from masiv.inference.evidence import Evidence
 from masiv.inference.model_fit import ModelFit, gauss_newton_fit, held_parameters
+from masiv.refinement import savage_dickey
 from masiv.refinement.hypotheses import (
     NEGLIGIBLE,
     Hypothesis,
@@ -22,6 +23,9 @@ from masiv.refinement.refits import reasons_against, with_free_places
 from masiv.refinement.rounds import Trial
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.workers import TaskError
+
+RESTART_DERIVATIVES = 3
+"""Jacobians that the fit of a model without an effect may take from where the fit with it ended."""
 
 
 @dataclass(frozen=True)
@@ -56,17 +60,18 @@ class RoundPosterior:
         fewer = len(state.fit.model.effects)
         can_act = {id(t.fitted) for t in trials if not t.impossible}
         kept = {k: h for k, h in hypotheses.items() if len(h.effects) == fewer or k in can_act}
-        simpler = [h.marginal.log_evidence for h in kept.values() if len(h.effects) == fewer]
+        weighed = _with_nested(state, kept, fewer)
+        simpler = [h.marginal.log_evidence for h in weighed.values() if len(h.effects) == fewer]
         if not simpler:
             raise MasivError(f"no model without a further effect can be weighed: {failed[id(state.fit)]}")
-        factors = {k: h.marginal.log_evidence - max(simpler) for k, h in kept.items()}
+        factors = {k: h.marginal.log_evidence - max(simpler) for k, h in weighed.items()}
         judged = [
             replace(t, log_bayes_factor=factors.get(id(t.fitted)), not_weighed=failed.get(id(t.fitted))) for t in trials
         ]
         judged.sort(key=lambda t: -math.inf if t.log_bayes_factor is None else t.log_bayes_factor, reverse=True)
         causes = settings.causes(state.forward_model, state.fit.model)
         shapes = {name: len(cause) for cause in causes for name in cause}
-        posterior = Posterior.of(list(kept.values()), len(causes), shapes)
+        posterior = Posterior.of(list(weighed.values()), len(causes), shapes)
         return cls(posterior, tuple(judged), evidence, kept, failed, at_mean)
 
     def with_completed(
@@ -103,12 +108,51 @@ class RoundPosterior:
             hypotheses[id(fitted)] = replace(found, fitted=fitted)
         return self._judging(state, [done, *others], settings, self.evidence, hypotheses, self.failed, at_mean=True)
 
+    def with_restarted(self, state: SearchState, trial: Trial, settings: SearchSettings) -> RoundPosterior:
+        """With the model without the effect of ``trial`` fitted again from where that ended: what a restart alone
+        explains is no evidence for an effect. Of the fits of a model the most probable one counts."""
+        model, known = state.forward_model, trial.fitted
+        simpler = replace(known.model, effects=tuple(n for n in known.model.effects if n != trial.effect))
+        parameters = model.parameters(simpler)
+        start = {p.name: known.values.get(p.name, state.fit.values.get(p.name, p.start)) for p in parameters}
+        held = held_parameters(model, known) & start.keys()
+        try:
+            again = gauss_newton_fit(
+                model, simpler, start, budget=RESTART_DERIVATIVES * (len(parameters) + 2),
+                robust_scale=state.robust_scale, held=held,
+            )  # fmt: skip
+            found = self._at_mean(state, again, settings)
+        except MasivError:
+            return self
+        hypotheses = {**self.hypotheses, id(again): found}
+        return self._judging(
+            state, self.trials, settings, self.evidence, hypotheses, self.failed, at_mean=self.at_mean
+        )  # fmt: skip
+
     def _at_mean(self, state: SearchState, fit: ModelFit, settings: SearchSettings) -> Hypothesis:
         """Raises NonFiniteError if ``fit`` has no derivatives."""
         model = state.forward_model
         line = linearized_at_mean(model, fit, self.evidence, state.robust_scale, settings.linearizations)
         (found,) = weighed(model, [(fit, line)], settings.workers, self.evidence)
         return found
+
+
+def _with_nested(state: SearchState, hypotheses: Mapping[int, Hypothesis], fewer: int) -> dict[int, Hypothesis]:
+    """``hypotheses``, those of ``fewer`` effects with no less evidence than the posterior of a model with one more, of
+    the same law, leaves them."""
+    out = dict(hypotheses)
+    for h in hypotheses.values():
+        if len(h.effects) <= fewer:
+            continue
+        for k, simpler in hypotheses.items():
+            added = h.effects - simpler.effects
+            if len(simpler.effects) != fewer or len(added) != 1 or simpler.law != h.law:
+                continue
+            (name,) = added
+            least = h.marginal.log_evidence - savage_dickey.log_bayes_factor(h, state.forward_model.term(name))
+            if least > out[k].marginal.log_evidence:
+                out[k] = replace(simpler, marginal=replace(simpler.marginal, log_evidence=least))
+    return out
 
 
 def _weighed(

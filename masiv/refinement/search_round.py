@@ -79,6 +79,9 @@ def _judged(
     while trial is not None and not trial.completed and _named(judged.posterior, fewer, settings):
         judged = judged.with_completed(state, without, trial, settings)
         trial = _most_probable(judged.posterior, judged.trials, fewer)
+    if trial is not None and _named(judged.posterior, fewer, settings):
+        judged = judged.with_restarted(state, trial, settings)
+        trial = _most_probable(judged.posterior, judged.trials, fewer)
     named, exchanges = trial is not None and _named(judged.posterior, fewer, settings), ()
     if trial is not None and not named and frozenset(trial.fitted.model.effects) in judged.posterior.credible_set():
         other, exchanges = with_exchanges(state.with_fit(trial.fitted), places, settings)
