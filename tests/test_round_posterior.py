@@ -74,6 +74,20 @@ def test_an_effect_as_large_as_what_another_grid_may_do_is_not_named(strength):
     assert [t.name for t in result.accepted] == ([NAME] if strength > 0.1 else [])
 
 
+class CoarseGrid(LinearModel):
+    """A grid that is too coarse: on finer ones the body moves as with a little of the effect."""
+
+    def finer_grids(self, model, values, index):
+        return [strength * EFFECTS[NAME] for strength in (0.02, 0.0205)]
+
+
+@pytest.mark.parametrize("strength", [0.02, 0.4])
+def test_what_a_finer_grid_explains_is_no_effect(strength):
+    model = CoarseGrid({"velocity_z": 0.3, f"{NAME}.strength": strength}, effects=ONE)
+    result = refine(model, [baseline(model)], settings())
+    assert [t.name for t in result.accepted] == ([NAME] if strength > 0.1 else [])
+
+
 class DeadZone(LinearModel):
     """A velocity of less than 0.15 m/s moves nothing: a fit that starts there stays."""
 

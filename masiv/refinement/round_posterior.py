@@ -18,6 +18,7 @@ from masiv.refinement.hypotheses import (
     evidence_of,
     weighed,
 )
+from masiv.refinement.other_grids import log_mean_evidence
 from masiv.refinement.posterior_fit import linearized_at_mean
 from masiv.refinement.refits import reasons_against, with_free_places
 from masiv.refinement.rounds import Trial
@@ -125,6 +126,27 @@ class RoundPosterior:
         except MasivError:
             return self
         hypotheses = {**self.hypotheses, id(again): found}
+        return self._judging(
+            state, self.trials, settings, self.evidence, hypotheses, self.failed, at_mean=self.at_mean
+        )  # fmt: skip
+
+    def with_other_grids(self, state: SearchState, trial: Trial, settings: SearchSettings) -> RoundPosterior:
+        """With no more evidence for the effect of ``trial`` than there is if its model, and the most probable one
+        without it, may be simulated on finer grids as well."""
+        model, fewer = state.forward_model, len(state.fit.model.effects)
+        with_it, without = self.hypotheses.get(id(trial.fitted)), self.posterior.best(fewer)
+        if with_it is None or without is None:
+            return self
+        try:
+            factor = log_mean_evidence(model, with_it, self.evidence)
+            factor -= log_mean_evidence(model, without, self.evidence)
+        except MasivError:
+            return self
+        least = with_it.marginal.log_evidence - factor
+        if least <= without.marginal.log_evidence:
+            return self
+        raised = replace(without, marginal=replace(without.marginal, log_evidence=least))
+        hypotheses = {**self.hypotheses, id(without.fitted): raised}
         return self._judging(
             state, self.trials, settings, self.evidence, hypotheses, self.failed, at_mean=self.at_mean
         )  # fmt: skip
