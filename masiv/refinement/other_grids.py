@@ -7,10 +7,10 @@ mean over all grids, of which none is better beforehand.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from masiv.inference.evidence import Evidence
 from masiv.models.base import ForwardModel
@@ -34,4 +34,4 @@ def log_mean_evidence(forward_model: ForwardModel, hypothesis: Hypothesis, evide
     for each in zip(*changes, strict=True):
         motions.append([field + change for field, change in zip(uncorrected, each, strict=True)])
     found = [evidence.marginal(replace(line, fields=fields), terms).log_evidence for fields in motions]
-    return float(logsumexp(found) - np.log(len(found)))
+    return float(np.logaddexp.reduce(found)) - math.log(len(found))

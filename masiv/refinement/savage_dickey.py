@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import log_ndtr
 
 from masiv.inference.evidence import strength_scales
 from masiv.models.base import EffectTerm
@@ -35,7 +35,7 @@ def log_bayes_factor(hypothesis: Hypothesis, term: EffectTerm) -> float:
             for p, above in zip(term.strengths, positive, strict=True))
         for k in range(len(strength_scales(term.strengths[0])))
     ]  # fmt: skip
-    at_zero = logsumexp(prior) - math.log(len(prior)) - 0.5 * len(index) * LOG2PI
+    at_zero = float(np.logaddexp.reduce(prior)) - math.log(len(prior)) - 0.5 * len(index) * LOG2PI
     posterior = -0.5 * (mean @ np.linalg.solve(covariance, mean) + np.linalg.slogdet(covariance)[1])
     posterior -= 0.5 * len(index) * LOG2PI
     spread = np.sqrt(np.diag(covariance))
