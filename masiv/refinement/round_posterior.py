@@ -25,7 +25,7 @@ from masiv.refinement.rounds import Trial
 from masiv.refinement.search_state import SearchSettings, SearchState
 from masiv.workers import TaskError
 
-RESTART_DERIVATIVES = 3
+RESTART_DERIVATIVES = 2
 """Jacobians that the fit of a model without an effect may take from where the fit with it ended."""
 
 
@@ -111,17 +111,21 @@ class RoundPosterior:
 
     def with_restarted(self, state: SearchState, trial: Trial, settings: SearchSettings) -> RoundPosterior:
         """With the model without the effect of ``trial`` fitted again from where that ended: what a restart alone
-        explains is no evidence for an effect. Of the fits of a model the most probable one counts."""
+        explains is no evidence for an effect. Of the fits of a model the most probable one counts; one that did not
+        end nearer to the observations is not looked at."""
         model, known = state.forward_model, trial.fitted
         simpler = replace(known.model, effects=tuple(n for n in known.model.effects if n != trial.effect))
         parameters = model.parameters(simpler)
         start = {p.name: known.values.get(p.name, state.fit.values.get(p.name, p.start)) for p in parameters}
         held = held_parameters(model, known) & start.keys()
+        before = min((h.fitted.cost for h in self.hypotheses.values() if h.fitted.model == simpler), default=math.inf)
         try:
             again = gauss_newton_fit(
                 model, simpler, start, budget=RESTART_DERIVATIVES * (len(parameters) + 2),
                 robust_scale=state.robust_scale, held=held,
             )  # fmt: skip
+            if again.cost >= before:
+                return self
             found = self._at_mean(state, again, settings)
         except MasivError:
             return self
