@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from linear_model import EFFECTS, NOISE, LinearModel, baseline
+from small import only_first_quick
 
 from masiv.inference.least_squares import linearize
 from masiv.inference.model_fit import evaluate_fit, gauss_newton_fit, residual_of
@@ -67,7 +68,7 @@ class OtherGrids(LinearModel):
         return [0.02 * sign * EFFECTS[NAME] for sign in (1, -1)]
 
 
-@pytest.mark.parametrize("strength", [0.02, 0.4])
+@pytest.mark.parametrize("strength", only_first_quick([0.02, 0.4]))
 def test_an_effect_as_large_as_what_another_grid_may_do_is_not_named(strength):
     model = OtherGrids({"velocity_z": 0.3, f"{NAME}.strength": strength}, effects=ONE)
     result = refine(model, [baseline(model)], settings())
@@ -81,7 +82,7 @@ class CoarseGrid(LinearModel):
         return [strength * EFFECTS[NAME] for strength in (0.02, 0.0205)]
 
 
-@pytest.mark.parametrize("strength", [0.02, 0.4])
+@pytest.mark.parametrize("strength", only_first_quick([0.02, 0.4]))
 def test_what_a_finer_grid_explains_is_no_effect(strength):
     model = CoarseGrid({"velocity_z": 0.3, f"{NAME}.strength": strength}, effects=ONE)
     result = refine(model, [baseline(model)], settings())
