@@ -85,6 +85,7 @@ def _judged(
     if trial is not None and _named(judged.posterior, fewer, settings):
         settings.progress("refine: simulate on finer grids", 0, 1, trial.effect)
         judged = judged.with_other_grids(state, trial, settings)
+        trial = _most_probable(judged.posterior, judged.trials, fewer)
         settings.progress("refine: simulate on finer grids", 1, 1, trial.effect)
     named, exchanges = trial is not None and _named(judged.posterior, fewer, settings), ()
     if trial is not None and not named and frozenset(trial.fitted.model.effects) in judged.posterior.credible_set():
