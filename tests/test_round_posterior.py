@@ -87,6 +87,8 @@ def test_what_a_finer_grid_explains_is_no_effect(strength):
     model = CoarseGrid({"velocity_z": 0.3, f"{NAME}.strength": strength}, effects=ONE)
     result = refine(model, [baseline(model)], settings())
     assert [t.name for t in result.accepted] == ([NAME] if strength > 0.1 else [])
+    for done in result.search.rounds:
+        assert done.accepted is None or any(done.accepted is t for t in done.trials)
 
 
 class DeadZone(LinearModel):
