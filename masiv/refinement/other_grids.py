@@ -20,8 +20,7 @@ from masiv.refinement.hypotheses import Hypothesis
 
 def log_mean_evidence(forward_model: ForwardModel, hypothesis: Hypothesis, evidence: Evidence) -> float:
     """Logarithm of the mean evidence of ``hypothesis`` on its own grid and on each finer one, on which its derivatives
-    are taken to be the same; that on its own grid if there are no others. Raises MasivError if it cannot be simulated
-    there."""
+    are taken to be the same. Raises MasivError if it cannot be simulated there."""
     line, model = hypothesis.linear, hypothesis.fitted.model
     terms = [forward_model.term(n) for n in model.effects]
     observations = forward_model.observations

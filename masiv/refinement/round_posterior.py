@@ -136,8 +136,10 @@ class RoundPosterior:
 
     def with_other_grids(self, state: SearchState, trial: Trial, settings: SearchSettings) -> RoundPosterior:
         """With no more evidence for the effect of ``trial`` than there is if its model, and the most probable one
-        without it, may be simulated on finer grids as well."""
+        without it, may be simulated on finer grids as well. As it is if the forward model has none."""
         model, fewer = state.forward_model, len(state.fit.model.effects)
+        if not any(e.grid_corrections for e in model.observations):
+            return self
         with_it, without = self.hypotheses.get(id(trial.fitted)), self.posterior.best(fewer)
         if with_it is None or without is None:
             return self

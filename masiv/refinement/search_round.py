@@ -83,11 +83,10 @@ def _judged(
         judged = judged.with_restarted(state, trial, settings)
         trial = _most_probable(judged.posterior, judged.trials, fewer)
     if trial is not None and _named(judged.posterior, fewer, settings):
-        label, effect = "refine: simulate on finer grids", trial.effect
-        settings.progress(label, 0, 1, effect)
+        settings.progress("refine: weigh on finer grids", 0, 1, trial.effect)
         judged = judged.with_other_grids(state, trial, settings)
+        settings.progress("refine: weigh on finer grids", 1, 1, trial.effect)
         trial = _most_probable(judged.posterior, judged.trials, fewer)
-        settings.progress(label, 1, 1, effect)
     named, exchanges = trial is not None and _named(judged.posterior, fewer, settings), ()
     if trial is not None and not named and frozenset(trial.fitted.model.effects) in judged.posterior.credible_set():
         other, exchanges = with_exchanges(state.with_fit(trial.fitted), places, settings)
